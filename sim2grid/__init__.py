@@ -1,0 +1,1 @@
+"""The bridge: grid plans driven through physics, and physics mapped back to the grid."""

@@ -1,0 +1,76 @@
+"""The `moonteam` command: a table of subcommands, each loaded only when it is asked for.
+
+A command module holds `Args`, a frozen dataclass whose docstring is the help text and
+whose fields tyro reads, and `run(args) -> int`, which returns the exit code.
+Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from moonteam import __version__
+from moonteam.errors import InputError
+
+COMMANDS = {
+    "train": ("training.command", "train a grid policy from a preset"),
+    "plan": ("moonteam.commands.plan", "plan a scenario and print the schedule"),
+    "replay": ("moonteam.commands.replay", "the grid env's trace of a list of actions"),
+    "rollout": ("sim2grid.command", "run a mission in physics: video and report"),
+    "evaluate grid": ("moonteam.commands.evaluate_grid", "planners side by side on a set"),
+    "evaluate replanning": (
+        "moonteam.commands.evaluate_replanning", "5 + 5 targets, new ones while under way"),
+    "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),
+    "site": ("moonteam.commands.site", "make, import and preview lunar terrain"),
+    "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
+    "bench train": ("training.bench", "training throughput"),
+    "bench physics": ("moonteam.commands.bench_physics", "physics steps per second"),
+    "doctor": ("moonteam.commands.doctor", "what this machine can do"),
+}
+
+
+def usage() -> str:
+    """The overview that `moonteam --help` prints."""
+    lines = [f"moonteam {__version__}: plan for a team of unlike robots on the Moon, "
+             "and prove the plan in physics.", "", "usage: moonteam COMMAND [options]", ""]
+    lines += [f"  {name:<20} {line}" for name, (_, line) in COMMANDS.items()]
+    return "\n".join([*lines, "", "moonteam COMMAND --help shows options and examples."])
+
+
+def find_command(words: list[str]) -> tuple[str, list[str]]:
+    """Splits the command's name (one or two words) from its arguments."""
+    for count in (2, 1):
+        name = " ".join(words[:count])
+        if len(words) >= count and name in COMMANDS:
+            return name, words[count:]
+    group = [name for name in COMMANDS if name.startswith(words[0] + " ")]
+    raise InputError("moonteam " + words[0], "no such command; one of: "
+                     + ", ".join(group or COMMANDS))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if words else 2
+    if words[0] == "--version":
+        print(__version__)
+        return 0
+    try:
+        name, rest = find_command(words)
+        module = importlib.import_module(COMMANDS[name][0])
+        import tyro
+
+        return module.run(tyro.cli(module.Args, prog=f"moonteam {name}", args=rest))
+    except InputError as error:
+        print(f"moonteam: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("moonteam: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""Reading what users write, and writing so that nothing is ever half-written."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from moonteam.errors import InputError
+
+T = TypeVar("T")
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The file's text. Raises InputError if it is missing, unreadable or not UTF-8."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(path, "no such file") from None
+    except IsADirectoryError:
+        raise InputError(path, "is a folder, a file is needed") from None
+    except UnicodeDecodeError:
+        raise InputError(path, "is not UTF-8 text") from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}") from None
+
+
+def convert(value: Any, kind: type[T], source: object, where: str = "") -> T:
+    """Checks a decoded JSON or YAML value against a msgspec Struct.
+
+    Unknown keys and wrong types become an InputError naming the key.
+    """
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at `")
+        key = path.rstrip("`").removeprefix("$").removeprefix(".")
+        key = ".".join(part for part in (where, key) if part).replace(".[", "[")
+        if problem.startswith("Object contains unknown field"):
+            allowed = _fields_at(kind, key.removeprefix(where).lstrip("."))
+            problem = problem.replace("Object contains unknown field", "unknown key")
+            problem += f"; allowed: {', '.join(allowed)}" if allowed else ""
+        raise InputError(source, problem.replace("Object missing", "missing"), key) from None
+
+
+def _fields_at(kind: Any, path: str) -> list[str]:
+    """Names allowed in the Struct reached from `kind` by a path such as ``robots[...]``."""
+    info = msgspec.inspect.type_info(kind)
+    for part in [p for p in path.replace("[", ".[").split(".") if p]:
+        info = _struct_or_item(info, part)
+    info = _struct_or_item(info, "")
+    if isinstance(info, msgspec.inspect.StructType):
+        return [field.encode_name for field in info.fields]
+    return []
+
+
+def _struct_or_item(info: Any, part: str) -> Any:
+    """One step down a msgspec type description; optional types are looked through."""
+    if isinstance(info, msgspec.inspect.UnionType):
+        kinds = [t for t in info.types if not isinstance(t, msgspec.inspect.NoneType)]
+        info = kinds[0]
+    if not part:
+        return info
+    if part.startswith("["):
+        return getattr(info, "item_type", info)
+    if isinstance(info, msgspec.inspect.StructType):
+        for field in info.fields:
+            if field.encode_name == part:
+                return field.type
+    return info
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path`, renamed onto it on success and removed on failure.
+
+    The suffix is kept, since writers such as ffmpeg choose their format by it.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Writes UTF-8 text, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | os.PathLike[str], value: Any, indent: int = 2) -> None:
+    """Writes JSON (msgspec Structs, dataclasses, lists, dicts, NumPy scalars via `.item()`)."""
+    write_text(path, dump_json(value, indent) + "\n")
+
+
+def dump_json(value: Any, indent: int = 0) -> str:
+    """JSON text; not-a-number and infinity become null, NumPy scalars and arrays are plain."""
+    data = msgspec.json.encode(value, enc_hook=_plain)
+    return (msgspec.json.format(data, indent=indent) if indent else data).decode()
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise NotImplementedError(f"cannot be written as JSON: {type(value).__name__}")

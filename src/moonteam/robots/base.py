@@ -1,0 +1,75 @@
+"""What the three kinds of robot share: one model and one controller each.
+
+Controllers are pure JAX functions over a small typed state, so both backends and vmap use
+the same code. Units: SI, radians. World frame: x east, y north, z up, site centre at the
+origin. Robot state is MuJoCo's: qpos = free joint (position [3], quaternion wxyz [4]) then
+joints; qvel = linear velocity in the world frame [3], angular in the body frame [3], joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from moonteam.terrain.surface import Surface
+
+GRAVITY = 1.62
+"""Lunar gravity, m/s^2."""
+
+
+class Command(NamedTuple):
+    """Where a robot should go. Arrays so that it can be vmapped and traced."""
+
+    xy: Array  # [2] m, waypoint in the world frame; a drone holds its height above ground there
+    speed: Array  # [] m/s, upper limit; 0 means hold the place
+    lost: Array  # [] bool, True: actuators off (the robot left the team)
+
+
+class Telemetry(NamedTuple):
+    """What a controller reports each control step."""
+
+    power: Array  # [] W, mechanical power asked of the actuators, >= 0
+    propellant: Array  # [] kg/s used; 0 for legged and wheeled
+
+
+@dataclass(frozen=True)
+class RobotKind:
+    """One kind of robot, as the scene and the backends use it.
+
+    `init(qpos, qvel) -> state` and `control(state, time, qpos, qvel, command, surface) ->
+    (ctrl [nu], state, Telemetry)`, all of this robot's own slices; called every
+    `control_period` seconds, the torques held in between. Pure, jittable, vmappable.
+    """
+
+    name: str
+    load: Callable[[], mujoco.MjSpec]  # the robot alone, base body with a free joint first
+    base: str  # name of the base body
+    spawn_height: float  # m, base above ground along the normal, standing still
+    home: np.ndarray  # [joints] joint angles at spawn, rad
+    speed: float  # m/s, the speed it travels at
+    footprint: float  # m, radius of what touches the ground
+    max_slope: float  # rad, beyond which it must not go
+    init: Callable[[Array, Array], Any]
+    control: Callable[[Any, Array, Array, Array, Command, Surface], tuple[Array, Any, Telemetry]]
+
+
+def quat_rotate(quat: Array, vector: Array) -> Array:
+    """Rotates a body-frame vector [3] into the world by a unit quaternion wxyz [4]."""
+    w, u = quat[0], quat[1:]
+    return vector + 2.0 * jnp.cross(u, jnp.cross(u, vector) + w * vector)
+
+
+def quat_matrix(quat: Array) -> Array:
+    """Rotation matrix [3, 3], body to world, of a unit quaternion wxyz [4]."""
+    w, x, y, z = quat
+    return jnp.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])

@@ -1,0 +1,166 @@
+"""One grid problem as a file: a JSON object, or one a line in a `.jsonl` set.
+
+This module knows neither wing. Cells are (x, y): x right, y up, origin lower left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from moonteam import files
+from moonteam.errors import InputError
+
+ACTIONS = ("up", "down", "left", "right", "stay")
+"""The paper's order: 0 up (+y), 1 down (-y), 2 left (-x), 3 right (+x), 4 stay."""
+
+MAX_SKILLS = 8
+
+Cell = tuple[int, int]
+
+
+class Agent(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A robot on the grid; `kind` matters only where some cells are blocked for some kinds."""
+
+    at: Cell
+    skills: tuple[str, ...]
+    kind: str | None = None
+
+
+class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A cell that needs skills: any of them (OR), or all at once (AND)."""
+
+    at: Cell
+    skills: tuple[str, ...]
+    type: Literal["AND", "OR"]
+
+
+class Optimal(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Certified optima of the two objectives, each on its own; None where not certified.
+
+    For sets too large to certify, the best known values stand in `best_*` and lower
+    bounds in `bound_*`.
+    """
+
+    makespan: int | None = None
+    moves: int | None = None
+    best_makespan: int | None = None
+    best_moves: int | None = None
+    bound_makespan: int | None = None
+    bound_moves: int | None = None
+
+
+class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A grid problem. `blocked` maps a kind (or ``*`` for all) to cells it cannot enter."""
+
+    size: tuple[int, int]
+    agents: tuple[Agent, ...]
+    targets: tuple[Target, ...]
+    id: str = ""
+    max_steps: int = 128
+    blocked: dict[str, tuple[Cell, ...]] | None = None
+    optimal: Optimal | None = None
+
+    @property
+    def skill_bits(self) -> dict[str, int]:
+        """Bit of each skill: a capital letter has its place in the alphabet (A=1, B=2, C=4).
+
+        Other names take the bits that are left, in sorted order.
+        """
+        names = sorted({s for item in (*self.agents, *self.targets) for s in item.skills})
+        letters = {s: 1 << (ord(s) - ord("A")) for s in names if s in "ABCDEFGH"}
+        free = (1 << b for b in range(MAX_SKILLS) if 1 << b not in letters.values())
+        return letters | {s: next(free) for s in names if s not in letters}
+
+    def mask(self, skills: Iterable[str]) -> int:
+        """Bitmask f(S) of a skill set: A=1, B=2, AB=3."""
+        bits = self.skill_bits
+        return sum(bits[s] for s in set(skills))
+
+
+def check(scenario: Scenario, source: object, where: str = "") -> Scenario:
+    """The rules that types cannot say. Raises InputError naming the key."""
+
+    def fail(key: str, problem: str) -> InputError:
+        return InputError(source, problem, f"{where}.{key}" if where else key)
+
+    width, height = scenario.size
+    if not (1 <= width <= 1024 and 1 <= height <= 1024):
+        raise fail("size", f"{list(scenario.size)} is not allowed; each side 1 to 1024")
+    if scenario.max_steps < 1:
+        raise fail("max_steps", f"{scenario.max_steps} is not allowed; at least 1")
+    if not scenario.agents:
+        raise fail("agents", "at least one agent is needed")
+    if not scenario.targets:
+        raise fail("targets", "at least one target is needed")
+    names = {s for item in (*scenario.agents, *scenario.targets) for s in item.skills}
+    if len(names) > MAX_SKILLS:
+        raise fail("agents", f"{len(names)} different skills; at most {MAX_SKILLS} are allowed")
+    for group, items in (("agents", scenario.agents), ("targets", scenario.targets)):
+        for i, item in enumerate(items):
+            check_cell(item.at, scenario.size, lambda p, k=f"{group}[{i}].at": fail(k, p))
+            if not item.skills or "" in item.skills:
+                raise fail(f"{group}[{i}].skills", "at least one non-empty skill name is needed")
+    first_at: dict[Cell, int] = {}
+    for j, target in enumerate(scenario.targets):
+        if target.at in first_at:
+            raise fail(f"targets[{j}].at",
+                       f"{list(target.at)} is already the cell of targets[{first_at[target.at]}]; "
+                       "target cells must differ")
+        first_at[target.at] = j
+    for kind, cells in (scenario.blocked or {}).items():
+        for i, cell in enumerate(cells):
+            check_cell(cell, scenario.size, lambda p, k=f"blocked.{kind}[{i}]": fail(k, p))
+    return scenario
+
+
+def check_cell(cell: Cell, size: tuple[int, int], fail) -> None:
+    """Raises `fail(problem)` if the cell lies off the map."""
+    x, y = cell
+    if not (0 <= x < size[0] and 0 <= y < size[1]):
+        raise fail(f"cell {[x, y]} is off the map; x in 0..{size[0] - 1}, y in 0..{size[1] - 1}")
+
+
+def missing_skills(scenario: Scenario) -> dict[int, list[str]]:
+    """Targets that the team can never solve, with the skills it lacks."""
+    team = {s for agent in scenario.agents for s in agent.skills}
+    lacking = {}
+    for j, target in enumerate(scenario.targets):
+        need = set(target.skills)
+        if (target.type == "AND" and not need <= team) or not need & team:
+            lacking[j] = sorted(need - team)
+    return lacking
+
+
+def _decode(text: str, source: object, where: str = "") -> Scenario:
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(source, f"not JSON: {error.msg} (column {error.colno})", where) from None
+    return check(files.convert(value, Scenario, source, where), source, where)
+
+
+def load(path: str | os.PathLike[str]) -> Scenario:
+    """One scenario from a JSON file. Raises InputError."""
+    return _decode(files.read_text(path), path)
+
+
+def load_set(path: str | os.PathLike[str]) -> list[Scenario]:
+    """A `.jsonl` set (or one `.json` scenario). Raises InputError naming the line."""
+    if Path(path).suffix == ".json":
+        return [load(path)]
+    lines = files.read_text(path).splitlines()
+    found = [_decode(line, path, f"line {n}") for n, line in enumerate(lines, 1) if line.strip()]
+    if not found:
+        raise InputError(path, "holds no scenario; one JSON object a line is needed")
+    return found
+
+
+def save_set(path: str | os.PathLike[str], scenarios: Iterable[Scenario]) -> None:
+    """Writes a `.jsonl` set, whole or not at all."""
+    files.write_text(path, "".join(files.dump_json(s) + "\n" for s in scenarios))

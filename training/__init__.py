@@ -1,0 +1,1 @@
+"""Learning: configuration, rollout, GAE, losses, imitation, the loop."""
