@@ -22,6 +22,12 @@ from moonteam.terrain.surface import Surface
 GRAVITY = 1.62
 """Lunar gravity, m/s^2."""
 
+PHYSICS_DT = 0.004
+"""Physics step, s."""
+
+CONTROL_PERIOD = 0.008
+"""Time between two calls of every controller, s; actuator commands are held in between."""
+
 
 class Command(NamedTuple):
     """Where a robot should go. Arrays so that it can be vmapped and traced."""
@@ -44,7 +50,7 @@ class RobotKind:
 
     `init(qpos, qvel) -> state` and `control(state, time, qpos, qvel, command, surface) ->
     (ctrl [nu], state, Telemetry)`, all of this robot's own slices; called every
-    `control_period` seconds, the torques held in between. Pure, jittable, vmappable.
+    CONTROL_PERIOD seconds. Pure, jittable, vmappable.
     """
 
     name: str
