@@ -4,6 +4,10 @@ Controllers are pure JAX functions over a small typed state, so both backends an
 the same code. Units: SI, radians. World frame: x east, y north, z up, site centre at the
 origin. Robot state is MuJoCo's: qpos = free joint (position [3], quaternion wxyz [4]) then
 joints; qvel = linear velocity in the world frame [3], angular in the body frame [3], joints.
+
+Contacts, as contype/conaffinity: height field 1/0, boulder 3/0, foot or wheel 0/1 (touches
+ground and boulders), hull 2/2 (one coarse sphere or so: touches boulders and other robots'
+hulls, never the height field, whose cost in MJX grows with geom size), visual 0/0.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ class Command(NamedTuple):
     """Where a robot should go. Arrays so that it can be vmapped and traced."""
 
     xy: Array  # [2] m, waypoint in the world frame; a drone holds its height above ground there
-    speed: Array  # [] m/s, upper limit; 0 means hold the place
+    speed: Array  # [] m/s, upper limit; 0: hold the place; below 0: a drone lands at xy
     lost: Array  # [] bool, True: actuators off (the robot left the team)
 
 
