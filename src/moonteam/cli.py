@@ -8,6 +8,7 @@ Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 inte
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 
 from moonteam import __version__
@@ -63,7 +64,10 @@ def main(argv: list[str] | None = None) -> int:
         module = importlib.import_module(COMMANDS[name][0])
         import tyro
 
-        return module.run(tyro.cli(module.Args, prog=f"moonteam {name}", args=rest))
+        args = tyro.cli(module.Args, prog=f"moonteam {name}", args=rest,
+                        description=inspect.getdoc(module.Args),
+                        config=(tyro.conf.FlagCreatePairsOff,))
+        return module.run(args)
     except InputError as error:
         print(f"moonteam: {error}", file=sys.stderr)
         return 2

@@ -45,18 +45,34 @@ def convert(value: Any, kind: type[T], source: object, where: str = "") -> T:
             allowed = _fields_at(kind, key.removeprefix(where).lstrip("."))
             problem = problem.replace("Object contains unknown field", "unknown key")
             problem += f"; allowed: {', '.join(allowed)}" if allowed else ""
+        elif problem.startswith("Invalid enum value"):
+            allowed = _choices_at(kind, key.removeprefix(where).lstrip("."))
+            problem = problem.replace("Invalid enum value", "unknown value")
+            problem += f"; allowed: {', '.join(allowed)}" if allowed else ""
         raise InputError(source, problem.replace("Object missing", "missing"), key) from None
 
 
 def _fields_at(kind: Any, path: str) -> list[str]:
     """Names allowed in the Struct reached from `kind` by a path such as ``robots[...]``."""
-    info = msgspec.inspect.type_info(kind)
-    for part in [p for p in path.replace("[", ".[").split(".") if p]:
-        info = _struct_or_item(info, part)
-    info = _struct_or_item(info, "")
+    info = _type_at(kind, path)
     if isinstance(info, msgspec.inspect.StructType):
         return [field.encode_name for field in info.fields]
     return []
+
+
+def _choices_at(kind: Any, path: str) -> list[str]:
+    """Values allowed by the Literal reached from `kind` by a path."""
+    info = _type_at(kind, path)
+    if isinstance(info, msgspec.inspect.LiteralType):
+        return [str(value) for value in info.values]
+    return []
+
+
+def _type_at(kind: Any, path: str) -> Any:
+    info = msgspec.inspect.type_info(kind)
+    for part in [p for p in path.replace("[", ".[").split(".") if p]:
+        info = _struct_or_item(info, part)
+    return _struct_or_item(info, "")
 
 
 def _struct_or_item(info: Any, part: str) -> Any:

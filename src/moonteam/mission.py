@@ -86,11 +86,23 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         )
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML that refuses a key given twice: the first would be lost without a word."""
+
+    def construct_mapping(self, node, deep=False):
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key, (where, _) in zip(keys, node.value, strict=True):
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is given twice", where.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def load(path: str | os.PathLike[str]) -> Mission:
     """Reads and checks a mission file. Raises InputError naming file, key and what is allowed."""
     text = files.read_text(path)
     try:
-        value = yaml.safe_load(text)
+        value = yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" (line {mark.line + 1})" if mark else ""

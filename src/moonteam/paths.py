@@ -17,7 +17,7 @@ def assets() -> Path:
 def find(name: str, folder: str, suffix: str) -> Path:
     """A user's file, else the bundled asset of that name (``demo`` for missions/demo.yaml)."""
     path = Path(name)
-    if path.exists() or path.suffix == suffix and path.parent != Path():
+    if path.exists() or (path.suffix == suffix and path.parent != Path()):
         return path
     bundled = assets() / folder / (name if name.endswith(suffix) else name + suffix)
     if bundled.is_file():

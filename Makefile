@@ -1,0 +1,34 @@
+# Needs Python 3.11 or 3.12, make and the network; everything else is set up here.
+PYTHON ?= $(shell command -v python3.12 || command -v python3.11 || command -v python3)
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: demo test lint check wheel clean
+
+demo: $(STAMP)
+	$(BIN)/moonteam rollout demo --planner policy --out runs/demo
+	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.json"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -q
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+wheel: $(STAMP)
+	PYTHON=$(PYTHON) BIN=$(BIN) sh .ci/wheel
+
+check: lint test demo wheel
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || \
+	  { echo "moonteam needs Python 3.11 or 3.12; say which with: make PYTHON=/path/to/python3.12"; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,ortools]'
+	@$(BIN)/moonteam doctor
+	@touch $(STAMP)
+
+clean:
+	rm -rf .venv build dist runs out

@@ -1,0 +1,110 @@
+"""`moonteam doctor`: what this machine can do, and what to install for the rest."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+
+from moonteam import compilation, files, paths
+
+PACKAGES = ("jax", "flax", "mujoco", "mujoco-mjx", "terraingenpy", "numba", "ortools")
+
+RENDER_PROBE = """
+import os
+os.environ.setdefault("MUJOCO_GL", "egl")
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    '<mujoco><worldbody><light pos="0 0 3"/><geom size="1"/></worldbody></mujoco>')
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 48, 64)
+renderer.update_scene(data)
+assert renderer.render().max() > 0
+os._exit(0)
+"""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Say what this machine can do: JAX devices, headless rendering, video, extras.
+
+    Examples:
+      moonteam doctor
+      moonteam doctor --json
+    """
+
+    json: bool = False
+    """Print one JSON document and nothing else."""
+
+
+def versions() -> dict[str, str | None]:
+    """Installed version of each package that matters; None where it is missing."""
+    found: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def rendering() -> tuple[bool, str]:
+    """Whether a frame can be drawn without a screen; a process of its own, since GL may abort."""
+    done = subprocess.run([sys.executable, "-c", RENDER_PROBE], capture_output=True, text=True,
+                          timeout=120, check=False)
+    if done.returncode == 0:
+        return True, "works (MUJOCO_GL=" + os.environ.get("MUJOCO_GL", "egl") + ")"
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    return False, ("does not work; on Debian or Ubuntu: apt-get install libegl1 libgl1 "
+                   f"libgl1-mesa-dri libglx-mesa0 ({last})")
+
+
+def examine() -> dict:
+    """Everything the command reports, as a JSON-able document."""
+    import jax
+
+    drawn, how = rendering()
+    try:
+        import imageio_ffmpeg
+
+        video: str | None = imageio_ffmpeg.get_ffmpeg_version()
+    except (ImportError, RuntimeError):
+        video = None
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "packages": versions(),
+        "devices": [{"platform": d.platform, "kind": d.device_kind} for d in jax.devices()],
+        "rendering": {"works": drawn, "note": how},
+        "ffmpeg": video,
+        "cache": str(compilation.cache_folder()),
+        "assets": str(paths.assets()),
+    }
+
+
+def run(args: Args) -> int:
+    """Prints the findings; always 0, since missing extras are no failure."""
+    found = examine()
+    if args.json:
+        print(files.dump_json(found))
+        return 0
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None)
+    table.add_row("Python", found["python"] + " on " + found["platform"])
+    table.add_row("cores", str(found["cores"]))
+    for name, version in found["packages"].items():
+        table.add_row(name, version or "not installed")
+    for device in found["devices"]:
+        table.add_row("JAX device", f"{device['platform']}: {device['kind']}")
+    table.add_row("3-D rendering", found["rendering"]["note"])
+    table.add_row("video", f"ffmpeg {found['ffmpeg']}" if found["ffmpeg"] else "no ffmpeg found")
+    table.add_row("cache", found["cache"])
+    Console().print(table)
+    return 0

@@ -1,0 +1,63 @@
+"""The command's edges: help, unknown words, files that are whole or not there."""
+
+import importlib
+import math
+
+import numpy as np
+import pytest
+
+from moonteam import cli, files, paths
+from moonteam.errors import InputError
+
+
+def test_usage_lists_every_command(capsys):
+    assert cli.main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in cli.COMMANDS)
+    assert cli.main([]) == 2
+
+
+@pytest.mark.parametrize("words", [["fly"], ["evaluate"], ["evaluate", "nothing"], ["bench"]])
+def test_unknown_commands_say_what_there_is(words, capsys):
+    assert cli.main(words) == 2
+    err = capsys.readouterr().err
+    assert "no such command; one of:" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_has_help_with_examples(name, capsys):
+    module = importlib.import_module(cli.COMMANDS[name][0])
+    assert callable(module.run)
+    with pytest.raises(SystemExit) as done:
+        cli.main([*name.split(), "--help"])
+    assert done.value.code == 0
+    assert "Examples" in capsys.readouterr().out
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "report.json"
+    files.write_json(path, {"whole": True})
+
+    def write_half():
+        with files.replacing(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        write_half()
+    assert path.read_text() == '{\n  "whole": true\n}\n'
+    assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_json_has_no_nan_and_takes_numpy():
+    assert files.dump_json({"a": math.nan, "b": np.float32(0.5), "c": np.arange(2)}) == (
+        '{"a":null,"b":0.5,"c":[0,1]}')
+
+
+def test_bundled_assets_are_found_by_name(tmp_path):
+    assert paths.find("demo", "missions", ".yaml").name == "demo.yaml"
+    with pytest.raises(InputError, match=r"bundled missions: .*demo"):
+        paths.find("nowhere", "missions", ".yaml")
+    with pytest.raises(InputError, match="no such file"):
+        paths.find(str(tmp_path / "x.yaml"), "missions", ".yaml")
