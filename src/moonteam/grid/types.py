@@ -1,8 +1,9 @@
 """The discrete world's data.
 
-Legend of shapes: N agents, M targets, K kinds, W columns (x), H rows (y); any leading
-batch axes come from vmap. Cells are int32 (x, y). Skills are int32 bitmasks, A=1, B=2.
-Arrays may be padded: `agent_mask` and `target_mask` are True where an entry is real.
+Legend of shapes: N agents, M targets (slots), B buffered targets, K kinds, W columns (x),
+H rows (y), D observation length; any leading batch axes come from vmap. Cells are int32
+(x, y). Skills are int32 bitmasks, A=1, B=2. Arrays may be padded: `agent_mask` and
+`target_mask` are True where an entry is real.
 """
 
 from __future__ import annotations
@@ -27,6 +28,22 @@ class Problem:
     target_and: Array  # [M] bool, True for AND
     target_mask: Array  # [M] bool
     passable: Array | None = None  # [K, H, W] bool, indexed [kind, y, x]; None: open map
+    buffer: Buffer | None = None  # targets still to come (replanning); None: there are none
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Buffer:
+    """Targets that appear one by one, each in the slot of one that was solved.
+
+    They are drawn with the problem, so that one problem asks the same of every planner;
+    nothing of them is observed before they appear.
+    """
+
+    cells: Array  # [B, 2] int32 cells
+    skills: Array  # [B] int32 bitmask
+    both: Array  # [B] bool, True for AND
+    used: Array  # [] int32, how many have appeared
 
 
 @jax.tree_util.register_dataclass
@@ -51,3 +68,18 @@ class Rewards:
     SC: Array  # [N] step cost, <= 0
     TC: Array  # [N] time cost, <= 0
     TB: Array  # [N] team bonus
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StepResult:
+    """All that one joint action brings about. Nothing is reset: see `env.renew` for that."""
+
+    state: State
+    observation: Array  # [N, D] float32, of `state`
+    rewards: Rewards
+    reward: Array  # [N] float32, the weighted sum
+    terminated: Array  # [] bool, every target is solved
+    truncated: Array  # [] bool, the horizon was reached and the episode is not terminated
+    true_moves: Array  # [N] bool, the agent's cell changed
+    newly_solved: Array  # [M] bool, solved in this step (the slot may hold a new target now)
