@@ -11,6 +11,7 @@ one of them has one of its skills, AND when together they have all. Legend as in
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
@@ -104,7 +105,8 @@ def available(state: State) -> Array:
     return jnp.stack(columns, axis=1)
 
 
-def renew(config: EnvConfig, key: Array, states: State, ended: Array) -> State:
+def renew(config: EnvConfig, key: Array, states: State, ended: Array,
+          draw: Callable[[Array], State] | None = None) -> State:
     """Fresh problems in place of the episodes that ended, for a batch of environments.
 
     Far fewer fresh problems are drawn than there are environments: each ended one takes its
@@ -116,20 +118,23 @@ def renew(config: EnvConfig, key: Array, states: State, ended: Array) -> State:
       key: one JAX key.
       states: [E] batch.
       ended: [E] bool.
+      draw: what a fresh state is drawn by, given a key, where it is not `reset(config, key)`:
+        mixed sizes, or blocked maps from a pool.
     """
+    start = draw or (lambda k: reset(config, k)[0])
     num_envs = ended.shape[0]
     few = max(1, num_envs // 16)
     rank = jnp.cumsum(ended) - 1  # [E] place of each ended episode among the ended
 
-    def draw(count: int) -> State:
-        return jax.vmap(lambda k: reset(config, k)[0])(jax.random.split(key, count))
+    def fresh_states(count: int) -> State:
+        return jax.vmap(start)(jax.random.split(key, count))
 
     def from_few() -> State:
-        fresh = draw(few)
+        fresh = fresh_states(few)
         index = jnp.clip(rank, 0, few - 1)
         return jax.tree.map(lambda x: x[index], fresh)
 
-    fresh = jax.lax.cond(rank[-1] < few, from_few, lambda: draw(num_envs))
+    fresh = jax.lax.cond(rank[-1] < few, from_few, lambda: fresh_states(num_envs))
     return jax.tree.map(
         lambda new, old: jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old),
         fresh, states)

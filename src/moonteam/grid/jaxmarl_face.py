@@ -1,0 +1,168 @@
+"""The grid environment with the interface of JaxMARL's `MultiAgentEnv`, without importing it.
+
+    env = MoonGrid(preset_config("pi_5t"))
+    observations, state = env.reset(key)
+    observations, state, rewards, dones, infos = env.step(key, state, actions)
+
+Dicts keyed by agent name exist only here; everything inside works on arrays.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from moonteam.grid import env
+from moonteam.grid.config import NUM_ACTIONS, EnvConfig
+from moonteam.grid.observe import observe
+from moonteam.grid.types import State
+
+ByAgent = dict[str, Array]
+
+
+class Discrete:
+    """The integers 0 .. n-1."""
+
+    def __init__(self, num_categories: int, dtype: Any = jnp.int32):
+        self.n = num_categories
+        self.shape = ()
+        self.dtype = dtype
+
+    def sample(self, rng: Array) -> Array:
+        """A uniform draw."""
+        return jax.random.randint(rng, self.shape, 0, self.n, self.dtype)
+
+    def contains(self, x: Array) -> Array:
+        """Whether `x` is one of them."""
+        return (x >= 0) & (x < self.n)
+
+
+class Box:
+    """Arrays of a shape, each entry between `low` and `high`."""
+
+    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any = jnp.float32):
+        self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
+
+    def sample(self, rng: Array) -> Array:
+        """A uniform draw."""
+        return jax.random.uniform(rng, self.shape, self.dtype, self.low, self.high)
+
+    def contains(self, x: Array) -> Array:
+        """Whether every entry of `x` is within the bounds."""
+        return jnp.all((x >= self.low) & (x <= self.high))
+
+
+class Spaces(Protocol):
+    """A module of space classes: this one, or `jaxmarl.environments.spaces`."""
+
+    Discrete: Any
+    Box: Any
+
+
+class _OwnSpaces:
+    Discrete = Discrete
+    Box = Box
+
+
+class MoonGrid:
+    """The grid as a JaxMARL environment.
+
+    Args:
+      config: the family of problems that `reset` samples, and the rewards.
+      spaces: where `Discrete` and `Box` come from. Wrappers that look at the class of a
+        space (JaxMARL's CTRolloutManager) need `jaxmarl.environments.spaces` here.
+    """
+
+    def __init__(self, config: EnvConfig | None = None, spaces: Spaces | None = None):
+        self.config = config or EnvConfig()
+        self.num_agents = self.config.num_agents
+        self.agents = [f"agent_{i}" for i in range(self.num_agents)]
+        maker = spaces or _OwnSpaces
+        bound = float(max(self.config.width - 1, self.config.height - 1,
+                          2**self.config.num_skills - 1))
+        shape = (self.config.obs_dim,)
+        self.observation_spaces = {a: maker.Box(-bound, bound, shape) for a in self.agents}
+        self.action_spaces = {a: maker.Discrete(NUM_ACTIONS) for a in self.agents}
+
+    @property
+    def name(self) -> str:
+        """The environment's name."""
+        return "MoonGrid"
+
+    @property
+    def agent_classes(self) -> dict[str, list[str]]:
+        """One class: every agent has the same spaces."""
+        return {"robot": list(self.agents)}
+
+    def observation_space(self, agent: str) -> Any:
+        """Box of the observation's length."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """Discrete(5): up, down, left, right, stay."""
+        return self.action_spaces[agent]
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: Array) -> tuple[ByAgent, State]:
+        """A new episode: observations by agent, and the state."""
+        state, observation = env.reset(self.config, key)
+        return self._split(observation), state
+
+    @partial(jax.jit, static_argnums=0)
+    def step(self, key: Array, state: State, actions: ByAgent, reset_state: State | None = None,
+             ) -> tuple[ByAgent, State, ByAgent, ByAgent, dict[str, Array]]:
+        """One step, and a new episode where this one ended.
+
+        Args:
+          key: JAX key, drawn from only for the new episode.
+          state: as from `reset` or `step`.
+          actions: [] int32 by agent.
+          reset_state: what to begin again from; None: a random problem.
+
+        Returns:
+          Observations (of the new episode where one began), state, rewards, dones with
+          "__all__", and infos: [N] arrays `terminated`, `truncated` and `true_moves`.
+        """
+        _, key_reset = jax.random.split(key)
+        observations, after, rewards, dones, infos = self.step_env(key, state, actions)
+        if reset_state is None:
+            fresh_observations, fresh = self.reset(key_reset)
+        else:
+            fresh_observations, fresh = self.get_obs(reset_state), reset_state
+        ended = dones["__all__"]
+        after, observations = jax.tree.map(
+            lambda new, old: jax.lax.select(ended, new, old),
+            (fresh, fresh_observations), (after, observations))
+        return observations, after, rewards, dones, infos
+
+    def step_env(self, key: Array, state: State, actions: ByAgent,
+                 ) -> tuple[ByAgent, State, ByAgent, ByAgent, dict[str, Array]]:
+        """One step without a new episode; the rules draw no random numbers."""
+        del key
+        result = env.step(self.config, state, jnp.stack([actions[a] for a in self.agents]))
+        ended = result.terminated | result.truncated
+        dones = dict.fromkeys([*self.agents, "__all__"], ended)
+        everyone = (self.num_agents,)
+        infos = {
+            "terminated": jnp.broadcast_to(result.terminated, everyone),
+            "truncated": jnp.broadcast_to(result.truncated, everyone),
+            "true_moves": result.true_moves,
+        }
+        return self._split(result.observation), result.state, self._split(result.reward), dones, \
+            infos
+
+    def get_obs(self, state: State) -> ByAgent:
+        """Observations [D] by agent."""
+        return self._split(observe(self.config, state))
+
+    @partial(jax.jit, static_argnums=0)
+    def get_avail_actions(self, state: State) -> ByAgent:
+        """[5] bool by agent: staying, and moves that the map does not turn back."""
+        return self._split(env.available(state))
+
+    def _split(self, values: Array) -> ByAgent:
+        return {agent: values[i] for i, agent in enumerate(self.agents)}
