@@ -1,0 +1,373 @@
+"""The quadruped: walks to a waypoint by placing feet and sharing out the force they bear.
+
+Each control step: the waypoint becomes a wanted body velocity; a gait clock says which feet
+carry and which swing; a wanted wrench on the body (velocity, height and attitude feedback
+plus weight) is split over the carrying feet by weighted least squares, each force cut to the
+friction cone about the ground's normal, and becomes joint torques tau = -J^T f; a swinging
+foot is drawn along an arc to a foothold that catches the body (Raibert 1986, "Legged Robots
+That Balance": hip + v T_stance / 2 + k (v - v_wanted)) at the terrain's height. The body
+aligns with a plane fitted to the ground under the four hips. No inverse kinematics.
+
+Shapes: L = 4 legs in the order front left, front right, rear left, rear right; J = 3 joints a
+leg: abduction about x, hip about y, knee about y. Unless said otherwise vectors are in the
+world frame; "level" is the world turned by the body's heading only.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from jax.scipy.linalg import cho_factor, cho_solve
+
+from moonteam.paths import assets
+from moonteam.robots.base import (
+    CONTROL_PERIOD,
+    GRAVITY,
+    Command,
+    RobotKind,
+    Telemetry,
+    quat_matrix,
+)
+from moonteam.terrain.surface import Surface
+
+MASS = 15.0  # kg
+INERTIA = np.array([0.26, 0.53, 0.66])  # kg m^2, whole robot standing at home, about its axes
+CENTRE = np.array([-0.017, 0.0, -0.018])  # m, centre of mass in the base frame, likewise
+SIDE = np.array([1.0, -1.0, 1.0, -1.0])  # [L] +1 left, -1 right
+END = np.array([1.0, 1.0, -1.0, -1.0])  # [L] +1 front, -1 rear
+HIP_X, HIP_Y = 0.20, 0.10  # m, abduction axes from the base
+OFFSET = 0.07  # m, sideways from the abduction axis to the leg's plane
+LINK = 0.22  # m, thigh and shank
+FOOT_RADIUS = 0.03  # m
+TORQUE_LIMIT = 40.0  # N m
+FALLEN = np.cos(np.radians(70.0))  # the base's up axis below this: no torques
+
+HIPS = np.stack([END * HIP_X, SIDE * HIP_Y, np.zeros(4)], axis=1)  # [L, 3] m, base frame
+LEG_OFFSETS = np.array([0.0, 0.5, 0.5, 0.0])  # [L] share of the period: a trot
+
+
+class Gait(NamedTuple):
+    """Gait and gains: what the search in `tune_legged` tunes.
+
+    Feedback is per unit mass, inertia and (where a force bears weight) gravity, so that a
+    heavier robot or another planet needs no other numbers.
+    """
+
+    period: float | Array = 0.42  # s
+    duty: float | Array = 0.66  # share of the period that a foot carries
+    height: float | Array = 0.27  # m, base above the ground plane
+    stance: float | Array = 0.175  # m, nominal foothold beside the base
+    length: float | Array = 0.20  # m, nominal foothold ahead of or behind the base
+    clearance: float | Array = 0.07  # m, swing arc above the higher of its ends
+    catch: float | Array = 0.12  # s, foothold moved per unit of velocity error
+    follow: float | Array = 1.0  # share of the ground's slope that the body takes on
+    speed: float | Array = 0.45  # m/s, most it tries
+    slow: float | Array = 0.8  # share of speed lost per unit of slope
+    velocity: float | Array = 5.0  # 1/s, velocity feedback
+    lift: float | Array = 80.0  # 1/s^2, height feedback
+    lift_damping: float | Array = 14.0  # 1/s
+    attitude: float | Array = 160.0  # 1/s^2, attitude feedback
+    attitude_damping: float | Array = 18.0  # 1/s
+    swing: float | Array = 36.0  # rad/s, bandwidth of the swinging foot
+    moment: float | Array = 0.02  # m^2, force error traded against moment error in the split
+    friction: float | Array = 0.6  # friction that the force split relies on
+
+
+GAIT = Gait()
+
+TURN_RATE = 0.7  # rad/s, most it turns
+ACCELERATION = 0.6  # m/s^2, most the wanted velocity changes
+NEAR = 0.35  # m, within it the robot steps sideways or backwards instead of turning
+ARRIVED, LEFT = 0.05, 0.18  # m, stands within the first, walks again beyond the second
+FOOT_MASS = 0.4  # kg, a leg's inertia as felt at the foot
+
+
+class LeggedState(NamedTuple):
+    """What the controller remembers."""
+
+    phase: Array  # [] share of the gait period, 0 to 1
+    grip: Array  # [L, 3] m, where each foot is or last was on the ground
+    wanted: Array  # [3] velocity asked of the body: x, y m/s (world), heading rad/s
+    holding: Array  # [] bool, at the waypoint: standing
+
+
+class _Body(NamedTuple):
+    """What the controller senses, from the joint state and the map."""
+
+    at: Array  # [3] m
+    rotation: Array  # [3, 3] base to world
+    velocity: Array  # [3] m/s
+    spin: Array  # [3] rad/s
+    level: Array  # [2, 2] rotation by the heading alone
+    feet: Array  # [L, 3] m
+    foot_velocity: Array  # [L, 3] m/s
+    jacobian: Array  # [L, 3, J] m/rad, foot over joint angle
+    joint_velocity: Array  # [L, J] rad/s
+    ground: Array  # [] m, fitted plane under the base
+    gradient: Array  # [2] fitted plane's rise in world x and y
+    gap: Array  # [L] m, foot over the ground
+    normal: Array  # [L, 3] ground's normal under each foot
+
+
+def leg_kinematics(angles: Array) -> tuple[Array, Array]:
+    """Feet [L, 3] m in the base frame and their Jacobians [L, 3, J] from angles [L, J] rad."""
+    roll, hip, knee = angles[:, 0], angles[:, 1], angles[:, 1] + angles[:, 2]
+    x = -LINK * (jnp.sin(hip) + jnp.sin(knee))
+    z = -LINK * (jnp.cos(hip) + jnp.cos(knee))
+    shank_x, shank_z = -LINK * jnp.sin(knee), -LINK * jnp.cos(knee)
+    y = jnp.asarray(SIDE * OFFSET, x.dtype)
+    cos, sin = jnp.cos(roll), jnp.sin(roll)
+    feet = jnp.stack([x, y * cos - z * sin, y * sin + z * cos], axis=1) + jnp.asarray(HIPS, x.dtype)
+    by_roll = jnp.stack([jnp.zeros_like(x), -y * sin - z * cos, y * cos - z * sin], axis=1)
+    by_hip = jnp.stack([z, x * sin, -x * cos], axis=1)
+    by_knee = jnp.stack([shank_z, shank_x * sin, -shank_x * cos], axis=1)
+    return feet, jnp.stack([by_roll, by_hip, by_knee], axis=2)
+
+
+def init(qpos: Array, qvel: Array) -> LeggedState:
+    """Standing still, feet where the joint angles put them."""
+    feet, _ = leg_kinematics(qpos[7:].reshape(4, 3))
+    grip = qpos[None, :3] + feet @ quat_matrix(qpos[3:7]).T
+    return LeggedState(jnp.zeros(()), grip, jnp.zeros(3), jnp.array(True))
+
+
+def control(
+    state: LeggedState, time: Array, qpos: Array, qvel: Array, command: Command, surface: Surface
+) -> tuple[Array, LeggedState, Telemetry]:
+    """Joint torques [12] N m toward the command; see `RobotKind`."""
+    return control_with(GAIT, state, time, qpos, qvel, command, surface)
+
+
+def control_with(
+    gait: Gait,
+    state: LeggedState,
+    time: Array,
+    qpos: Array,
+    qvel: Array,
+    command: Command,
+    surface: Surface,
+) -> tuple[Array, LeggedState, Telemetry]:
+    """`control` with a gait of one's own; its numbers may be traced."""
+    del time
+    qpos = jnp.clip(jnp.nan_to_num(qpos), -1e3, 1e3)
+    qvel = jnp.clip(jnp.nan_to_num(qvel), -1e2, 1e2)
+    body = _sense(gait, qpos, qvel, surface)
+    state = _guide(gait, state, body, command)
+    state, swing, progress = _clock(gait, state, body)
+    foothold = _footholds(gait, state, body, swing, progress, surface)
+    forces = _stance_forces(gait, state, body, swing, progress)
+    forces = forces + _swing_forces(gait, state, body, swing, progress, foothold)
+    torque = jnp.einsum("lij,li->lj", body.jacobian, forces).reshape(12)
+    off = command.lost | (body.rotation[2, 2] < FALLEN)
+    torque = jnp.where(off, 0.0, jnp.clip(torque, -TORQUE_LIMIT, TORQUE_LIMIT))
+    power = jnp.sum(jnp.maximum(torque * qvel[6:], 0.0))
+    return torque, state, Telemetry(power, jnp.zeros_like(power))
+
+
+def _sense(gait: Gait, qpos: Array, qvel: Array, surface: Surface) -> _Body:
+    quat = qpos[3:7] / (jnp.linalg.norm(qpos[3:7]) + 1e-9)
+    rotation = quat_matrix(quat)
+    velocity, spin = qvel[:3], rotation @ qvel[3:6]
+    joint_velocity = qvel[6:].reshape(4, 3)
+    feet, jacobian = leg_kinematics(qpos[7:].reshape(4, 3))
+    arms, jacobian = feet @ rotation.T, jnp.einsum("ij,ljk->lik", rotation, jacobian)
+    feet = qpos[:3][None, :] + arms
+    foot_velocity = velocity[None, :] + jnp.cross(spin[None, :], arms)
+    foot_velocity = foot_velocity + jnp.einsum("lij,lj->li", jacobian, joint_velocity)
+    ahead = rotation[:2, 0] / (jnp.linalg.norm(rotation[:2, 0]) + 1e-6)
+    level = jnp.stack([ahead, jnp.stack([-ahead[1], ahead[0]])], axis=1)
+    under = qpos[:2][None, :] + _nominal(gait) @ level.T
+    heights = surface.height(jnp.concatenate([under, feet[:, :2]]))
+    plane, below = heights[:4], heights[4:]
+    rise = jnp.stack([jnp.sum(plane * END) / gait.length, jnp.sum(plane * SIDE) / gait.stance])
+    normal = surface.normal(feet[:, :2])
+    gap = (feet[:, 2] - below) * normal[:, 2] - FOOT_RADIUS
+    return _Body(
+        qpos[:3], rotation, velocity, spin, level, feet, foot_velocity, jacobian,
+        joint_velocity, jnp.mean(plane), level @ rise / 4.0, gap, normal,
+    )  # fmt: skip
+
+
+def _nominal(gait: Gait) -> Array:
+    """Feet [L, 2] m under a standing robot, level frame."""
+    return jnp.stack([jnp.asarray(END) * gait.length, jnp.asarray(SIDE) * gait.stance], axis=1)
+
+
+def _guide(gait: Gait, state: LeggedState, body: _Body, command: Command) -> LeggedState:
+    """From the waypoint to a wanted velocity that changes smoothly."""
+    way = command.xy - body.at[:2]
+    distance = jnp.linalg.norm(way)
+    near = jnp.where(state.holding, distance < LEFT, distance < ARRIVED)
+    holding = near | (command.speed <= 0.0)
+    local = body.level.T @ way
+    error = jnp.where(distance > NEAR, jnp.arctan2(local[1], local[0]), 0.0)
+    facing = jnp.clip(1.6 * jnp.cos(error) - 0.6, 0.0, 1.0)
+    limit = jnp.minimum(command.speed, gait.speed)
+    limit = limit * jnp.clip(1.0 - gait.slow * jnp.linalg.norm(body.gradient), 0.3, 1.0)
+    speed = jnp.minimum(limit, 1.2 * distance) * facing
+    velocity = way / (distance + 1e-6) * speed
+    turn = jnp.clip(1.5 * error, -TURN_RATE, TURN_RATE)
+    goal = jnp.where(holding, 0.0, jnp.concatenate([velocity, turn[None]]))
+    most = ACCELERATION * CONTROL_PERIOD * jnp.array([1.0, 1.0, 4.0])
+    wanted = state.wanted + jnp.clip(goal - state.wanted, -most, most)
+    return state._replace(wanted=wanted, holding=holding)
+
+
+def _clock(gait: Gait, state: LeggedState, body: _Body) -> tuple[LeggedState, Array, Array]:
+    """Advances the gait; which feet swing [L] bool and how far they are, 0 to 1 [L].
+
+    The clock rests where all feet carry while nothing is asked and the feet stand well.
+    """
+    asked = jnp.linalg.norm(state.wanted * jnp.array([1.0, 1.0, 0.25])) > 0.02
+    nominal = body.at[:2][None, :] + _nominal(gait) @ body.level.T
+    astray = jnp.max(jnp.linalg.norm(body.feet[:, :2] - nominal, axis=1)) > 0.08
+    pushed = jnp.linalg.norm(body.velocity[:2]) > 0.15
+    offsets = jnp.asarray(LEG_OFFSETS)
+    resting = jnp.all((state.phase + offsets) % 1.0 < gait.duty)
+    go = asked | astray | pushed | ~resting
+    phase = jnp.where(go, (state.phase + CONTROL_PERIOD / gait.period) % 1.0, state.phase)
+    legs = (phase + offsets) % 1.0
+    progress = jnp.clip((legs - gait.duty) / (1.0 - gait.duty), 0.0, 1.0)
+    landed = (progress > 0.6) & (body.gap < 0.004)
+    swing = (legs >= gait.duty) & ~landed
+    grip = jnp.where(swing[:, None], state.grip, body.feet)
+    return state._replace(phase=phase, grip=grip), swing, progress
+
+
+def _footholds(
+    gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array, surface: Surface
+) -> Array:
+    """Where each foot's centre is to land [L, 3] m."""
+    hips = _nominal(gait) @ body.level.T  # [L, 2] from the base
+    turned = jnp.stack([-hips[:, 1], hips[:, 0]], axis=1)
+    wanted = state.wanted[None, :2] + state.wanted[2] * turned
+    velocity = body.velocity[None, :2] + body.spin[2] * turned
+    stride = gait.period * gait.duty / 2.0
+    left = (1.0 - progress) * (1.0 - gait.duty) * gait.period
+    place = body.at[:2][None, :] + hips + wanted * stride + gait.catch * (velocity - wanted)
+    place = place + velocity * left[:, None]
+    reach = place - body.at[:2][None, :] - hips
+    far = jnp.linalg.norm(reach, axis=1, keepdims=True)
+    place = place - reach * jnp.maximum(0.0, 1.0 - 0.18 / (far + 1e-6))
+    # A foot that should carry but hangs in the air goes straight down.
+    place = jnp.where(swing[:, None], place, body.feet[:, :2])
+    ground = surface.height(place)
+    return jnp.concatenate([place, ground[:, None] + FOOT_RADIUS - 0.005], axis=1)
+
+
+def _swing_forces(
+    gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array, foothold: Array
+) -> Array:
+    """Force that draws each free foot along its arc [L, 3] N; zero for feet that carry."""
+    s = progress
+    along = s * s * (3.0 - 2.0 * s)
+    rate = 6.0 * s * (1.0 - s) / ((1.0 - gait.duty) * gait.period)
+    start, way = state.grip, foothold - state.grip
+    arc = jnp.maximum(gait.clearance + jnp.maximum(way[:, 2], -way[:, 2]) * 0.5, 0.0)
+    bump, bump_rate = 16.0 * (s * (1 - s)) ** 2, 32.0 * s * (1 - s) * (1 - 2 * s)
+    bump_rate = bump_rate / ((1.0 - gait.duty) * gait.period)
+    target = start + way * along[:, None]
+    target = target.at[:, 2].add(arc * bump)
+    velocity = way * rate[:, None]
+    velocity = velocity.at[:, 2].add(arc * bump_rate)
+    hanging = ~swing & (body.gap > 0.01)
+    target = jnp.where(swing[:, None], target, foothold)
+    drop = jnp.array([0.0, 0.0, -0.25])
+    velocity = jnp.where(swing[:, None], velocity, drop[None, :] + body.velocity[None, :])
+    stiffness, damping = FOOT_MASS * gait.swing**2, FOOT_MASS * 1.5 * gait.swing
+    pull = stiffness * jnp.clip(target - body.feet, -0.1, 0.1)
+    pull = pull + damping * (velocity - body.foot_velocity)
+    return jnp.where((swing | hanging)[:, None], pull, 0.0)
+
+
+def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
+    """Wanted force [3] N and moment [3] N m of the ground on the robot."""
+    gradient = gait.follow * body.gradient
+    up = jnp.concatenate([-gradient, jnp.ones(1)])
+    up = up / jnp.linalg.norm(up)
+    feet = jnp.mean(body.feet[:, :2], axis=0) - body.at[:2]
+    ends = jnp.sum(body.feet[:, :2] * END[:, None], axis=0) / 2.0
+    local = body.level.T @ ends
+    standing = jnp.linalg.norm(state.wanted) < 0.01
+    yaw = jnp.where(standing, jnp.arctan2(local[1], local[0]), 0.0)
+    push = gait.velocity * (state.wanted[:2] - body.velocity[:2])
+    push = push + jnp.where(standing, 8.0 * feet, 0.0)
+    push = push / jnp.maximum(1.0, jnp.linalg.norm(push) / (0.6 * GRAVITY))
+    rise = body.ground + gait.height - body.at[2]
+    climb = body.gradient @ body.velocity[:2] - body.velocity[2]
+    lift = GRAVITY + gait.lift * jnp.clip(rise, -0.05, 0.05) + gait.lift_damping * climb
+    lift = jnp.clip(lift, 0.2 * GRAVITY, 3.0 * GRAVITY)
+    force = MASS * jnp.concatenate([push, lift[None]])
+    tilt = jnp.cross(body.rotation[:, 2], up) + jnp.array([0.0, 0.0, 1.0]) * 0.3 * yaw
+    spin = jnp.array([0.0, 0.0, 1.0]) * state.wanted[2] - body.spin
+    twist = gait.attitude * tilt + gait.attitude_damping * spin
+    moment = body.rotation @ (INERTIA * (body.rotation.T @ twist))
+    return jnp.concatenate([force, moment])
+
+
+def _stance_forces(
+    gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array
+) -> Array:
+    """Force of each carrying foot on the ground [L, 3] N: the wanted wrench, split.
+
+    min |A f - b|^2_S + |f|^2_(1/w): f = w A^T (A w A^T + S^-1)^-1 b, repeated on what the
+    friction cones cut away.
+    """
+    wanted = _wrench(gait, state, body)
+    legs = (state.phase + jnp.asarray(LEG_OFFSETS)) % 1.0
+    ease = jnp.clip(jnp.minimum(legs, gait.duty - legs) / 0.06 + 0.15, 0.15, 1.0)
+    touch = jnp.clip(1.0 - (body.gap - 0.004) / 0.012, 0.0, 1.0)
+    weight = jnp.where(swing, 0.0, ease * touch)  # [L]
+    arms = body.feet - (body.at + body.rotation @ jnp.asarray(CENTRE, jnp.float32))[None, :]
+    x, y, z = arms.T
+    o = jnp.zeros_like(x)
+    cross = jnp.stack([
+        jnp.stack([o, -z, y], axis=1), jnp.stack([z, o, -x], axis=1), jnp.stack([-y, x, o], axis=1)
+    ], axis=1)  # fmt: skip
+    eye = jnp.broadcast_to(jnp.eye(3), (4, 3, 3))
+    grasp = jnp.concatenate([eye, cross], axis=1)  # [L, 6, 3]
+    slack = jnp.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0])
+    slack = slack * jnp.where(jnp.arange(6) < 3, 1.0, 0.02 * gait.moment)
+    matrix = jnp.einsum("l,lij,lkj->ik", weight, grasp, grasp) + jnp.diag(slack)
+    factor = cho_factor(matrix, lower=True)
+    forces = jnp.zeros((4, 3))
+    for _ in range(3):
+        missing = wanted - jnp.einsum("lij,lj->i", grasp, forces)
+        share = cho_solve(factor, missing)
+        forces = forces + weight[:, None] * jnp.einsum("lij,i->lj", grasp, share)
+        forces = _cut(gait, forces, body.normal, weight)
+    return -forces
+
+
+def _cut(gait: Gait, forces: Array, normal: Array, weight: Array) -> Array:
+    """Forces [L, 3] inside the friction cones about normal [L, 3], none pulling."""
+    least = 0.05 * MASS * GRAVITY * weight
+    pressed = jnp.clip(jnp.sum(forces * normal, axis=1), least, 2.5 * MASS * GRAVITY)
+    along = forces - jnp.sum(forces * normal, axis=1, keepdims=True) * normal
+    size = jnp.linalg.norm(along, axis=1)
+    along = along * jnp.minimum(1.0, gait.friction * pressed / (size + 1e-6))[:, None]
+    return pressed[:, None] * normal + along
+
+
+def _load() -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(assets() / "robots" / "legged.xml"))
+
+
+_HIP_ANGLE = float(np.arccos((GAIT.height - FOOT_RADIUS) / (2 * LINK)))
+
+LEGGED = RobotKind(
+    name="legged",
+    load=_load,
+    base="base",
+    spawn_height=float(GAIT.height),
+    home=np.tile([0.0, _HIP_ANGLE, -2 * _HIP_ANGLE], 4),
+    speed=0.4,
+    footprint=0.32,
+    max_slope=float(np.radians(20.0)),
+    init=init,
+    control=control,
+)
