@@ -39,6 +39,7 @@ class Snapshot:
     step: int = 0
     max_steps: int = 128
     passable: BoolArray | None = None  # [K, H, W] indexed [kind, y, x]
+    skill_names: tuple[str, ...] = tuple("ABCDEFGH")  # of bits 1, 2, 4, ...
 
     @classmethod
     def start(cls, scenario: Scenario) -> Snapshot:
@@ -55,7 +56,16 @@ class Snapshot:
             agent_mask=np.ones(len(agents), bool), target_cells=target_cells,
             target_skills=need, target_and=both,
             solved=solved_now(cells, skills, target_cells, need, both),
-            step=0, max_steps=scenario.max_steps, passable=passable)
+            step=0, max_steps=scenario.max_steps, passable=passable,
+            skill_names=skill_names(scenario))
+
+
+def skill_names(scenario: Scenario) -> tuple[str, ...]:
+    """Name of every skill bit 1, 2, 4, ...; bits that are not used have their letter."""
+    names = list("ABCDEFGH")
+    for name, bit in scenario.skill_bits.items():
+        names[bit.bit_length() - 1] = name
+    return tuple(names)
 
 
 def passable_maps(scenario: Scenario) -> tuple[IntArray, BoolArray | None]:

@@ -1,0 +1,90 @@
+"""The grid's rules on the host: a few lines of NumPy, for replaying plans without JAX.
+
+The environment in `moonteam.grid` is the rule; tests hold this twin to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from moonteam.planners.base import BoolArray, IntArray, Snapshot, solved_now
+from moonteam.scenario import ACTIONS
+
+DISPLACEMENTS = np.array([(0, 1), (0, -1), (-1, 0), (1, 0), (0, 0)], np.int32)
+"""Cells (x, y) that each action adds: up, down, left, right, stay."""
+
+STAY = ACTIONS.index("stay")
+
+
+def moved(snapshot: Snapshot, actions: npt.ArrayLike) -> IntArray:
+    """Cells [N, 2] after the joint action [N]; the border and blocked cells throw back.
+
+    Lost agents (`agent_mask` False) do not move.
+    """
+    chosen = np.where(snapshot.agent_mask, np.asarray(actions, np.int32), STAY)
+    wanted = snapshot.cells + DISPLACEMENTS[chosen]
+    width, height = snapshot.size
+    free = (wanted >= 0).all(-1) & (wanted[:, 0] < width) & (wanted[:, 1] < height)
+    if snapshot.passable is not None:
+        x, y = np.where(free[:, None], wanted, snapshot.cells).T
+        here = (wanted == snapshot.cells).all(-1)
+        free &= here | snapshot.passable[snapshot.agent_kinds, y, x]
+    return np.where(free[:, None], wanted, snapshot.cells).astype(np.int32)
+
+
+def holding(snapshot: Snapshot) -> BoolArray:
+    """[M] True where a target is solved, or its requirement holds at this moment."""
+    skills = np.where(snapshot.agent_mask, snapshot.agent_skills, 0)
+    return snapshot.solved | solved_now(snapshot.cells, skills, snapshot.target_cells,
+                                        snapshot.target_skills, snapshot.target_and)
+
+
+def step(snapshot: Snapshot, actions: npt.ArrayLike) -> Snapshot:
+    """The next moment: everybody moves, then targets are solved."""
+    after = replace(snapshot, cells=moved(snapshot, actions), step=snapshot.step + 1)
+    return replace(after, solved=holding(after))
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a list of joint actions did, up to the step that solved the last target."""
+
+    cells: IntArray  # [T + 1, N, 2] cells, entry 0 is the start
+    solved: BoolArray  # [T + 1, M]
+    actions: IntArray  # [T, N]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every target was solved."""
+        return bool(self.solved[-1].all())
+
+    @property
+    def makespan(self) -> int | None:
+        """Steps until the last target was solved; None if some never were."""
+        return len(self.actions) if self.complete else None
+
+    @property
+    def moves(self) -> int:
+        """Actions other than stay, of all agents."""
+        return int((self.actions != STAY).sum())
+
+
+def replay(snapshot: Snapshot, actions: Iterable[npt.ArrayLike]) -> Trace:
+    """Plays joint actions until all targets are solved or the actions or steps run out."""
+    now = replace(snapshot, solved=holding(snapshot))
+    cells, solved, done = [now.cells], [now.solved], []
+    for joint in actions:
+        if now.solved.all() or now.step >= now.max_steps:
+            break
+        chosen = np.where(now.agent_mask, np.asarray(joint, np.int32), STAY)
+        now = step(now, chosen)
+        cells.append(now.cells)
+        solved.append(now.solved)
+        done.append(chosen)
+    agents = len(snapshot.cells)
+    return Trace(np.array(cells), np.array(solved),
+                 np.array(done, np.int32).reshape(len(done), agents))
