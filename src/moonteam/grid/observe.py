@@ -22,15 +22,15 @@ def observe(config: EnvConfig, state: State) -> Array:
     num_agents, num_targets = state.cells.shape[0], state.solved.shape[0]
     real = problem.agent_mask
     if config.normalize_positions:
-        unit = 1.0 / jnp.maximum(problem.size - 1, 1).astype(jnp.float32)  # [2]
+        span = jnp.maximum(problem.size - 1, 1).astype(jnp.float32)  # [2] cells
     else:
-        unit = jnp.ones((2,), jnp.float32)
-    scaled = state.cells.astype(jnp.float32) * unit[None, :]
+        span = jnp.ones((2,), jnp.float32)
+    scaled = state.cells.astype(jnp.float32) / span[None, :]
     positions = jnp.where(real[:, None], scaled, 0.0)  # [N, 2]
     others = _others(positions, num_agents).reshape(num_agents, -1)
     offset = problem.target_cells[None, :, :] - state.cells[:, None, :]
     wanted = ~state.solved[None, :, None] & real[:, None, None]
-    relative = jnp.where(wanted, offset.astype(jnp.float32) * unit[None, None, :], 0.0)
+    relative = jnp.where(wanted, offset.astype(jnp.float32) / span[None, None, :], 0.0)
     skills = jnp.where(real, problem.agent_skills, 0).astype(jnp.float32)
     target_mask = problem.target_mask
     numbers = jnp.where(target_mask, problem.target_skills, 0).astype(jnp.float32)
