@@ -1,8 +1,9 @@
 """The ground as a function: height, normal and slope at (x, y), jittable and batched.
 
 Heights stand on a regular grid, row 0 in the south, column 0 in the west, the site's centre
-at the origin. Each square is split into two triangles as MuJoCo splits a height field, so
-what a robot feels is what the engines collide with.
+at the origin. Each square is split into two triangles along the diagonal from its south-west
+to its north-east corner, as MuJoCo splits a height field, so what a controller asks is what
+the engines collide with (the tests shoot MuJoCo rays at it).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 
@@ -36,32 +38,55 @@ class Surface:
     def normal(self, xy: Array) -> Array:
         """Unit normal [..., 3] of the triangle under xy [..., 2] m."""
         _, gradient, _ = self._triangle(xy)
-        up = jnp.concatenate([-gradient, jnp.ones_like(gradient[..., :1])], axis=-1)
-        return up / jnp.linalg.norm(up, axis=-1, keepdims=True)
+        return _normal(gradient)
 
     def slope(self, xy: Array) -> Array:
         """Slope [...] rad of the triangle under xy [..., 2] m."""
         _, gradient, _ = self._triangle(xy)
         return jnp.arctan(jnp.linalg.norm(gradient, axis=-1))
 
-    def _triangle(self, xy: Array) -> tuple[Array, Array, Array]:
-        """South-west corner height [...], gradient [..., 2], offset from the corner [..., 2].
+    def plane(self, xy: Array, radius: Array | float) -> tuple[Array, Array]:
+        """Plane fitted to the ground within `radius` m of xy [..., 2] m.
 
-        MuJoCo splits a square along the diagonal from its south-west... corner pair
-        (x+1, y) to (x, y+1): see mjc_ConvexHField's order of prism vertices.
+        Least squares over a ring of eight points and the centre. Returns the plane's height
+        at xy [...] m and its unit normal [..., 3]: what a body that wide stands on.
+        """
+        ring = jnp.asarray(radius, jnp.float32) * _RING  # [8, 2]
+        around = self.height(xy[..., None, :] + ring.reshape((1,) * (xy.ndim - 1) + (8, 2)))
+        centre = self.height(xy)
+        # Least squares for points symmetric about the centre: sum(h * d) / sum(d^2) per axis.
+        gradient = around @ (ring / jnp.sum(ring[:, 0] ** 2))
+        return (jnp.sum(around, axis=-1) + centre) / 9.0, _normal(gradient)
+
+    def _triangle(self, xy: Array) -> tuple[Array, Array, Array]:
+        """The triangle under a point: height [...] of the square's south-west corner,
+        gradient [..., 2] and the point's offset [..., 2] m from that corner.
         """
         ny, nx = self.heights.shape
-        half = jnp.array(self.extent)
-        last = jnp.array([nx - 1, ny - 1], jnp.float32)
-        at = jnp.clip((xy + half) / self.spacing, 0.0, last - 1e-4)
-        cell = jnp.floor(at).astype(jnp.int32)
-        fx, fy = jnp.moveaxis(at - cell, -1, 0)
+        lead = (1,) * (xy.ndim - 1)
+        half = jnp.array(self.extent, jnp.float32).reshape((*lead, 2))
+        last = jnp.array([nx - 1, ny - 1], jnp.float32).reshape((*lead, 2))
+        at = jnp.clip((xy + half) / self.spacing, 0.0, last)
+        cell = jnp.minimum(jnp.floor(at), last - 1.0).astype(jnp.int32)
+        offset = at - cell
+        fx, fy = offset[..., 0], offset[..., 1]
         x, y = cell[..., 0], cell[..., 1]
         sw, se = self.heights[y, x], self.heights[y, x + 1]
         nw, ne = self.heights[y + 1, x], self.heights[y + 1, x + 1]
-        lower = fx + fy <= 1.0
-        gx = jnp.where(lower, se - sw, ne - nw)
-        gy = jnp.where(lower, nw - sw, ne - se)
-        corner = jnp.where(lower, sw, se + nw - ne)
+        south = fx >= fy  # the triangle south-west, south-east, north-east
+        gx = jnp.where(south, se - sw, ne - nw)
+        gy = jnp.where(south, ne - se, nw - sw)
         gradient = jnp.stack([gx, gy], axis=-1) / self.spacing
-        return corner, gradient, jnp.stack([fx, fy], axis=-1) * self.spacing
+        return sw, gradient, offset * self.spacing
+
+
+_RING = np.array(
+    [[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)], np.float32
+)
+"""Eight unit directions [8, 2]."""
+
+
+def _normal(gradient: Array) -> Array:
+    """Unit normal [..., 3] of a plane with gradient [..., 2]."""
+    up = jnp.concatenate([-gradient, jnp.ones_like(gradient[..., :1])], axis=-1)
+    return up / jnp.linalg.norm(up, axis=-1, keepdims=True)

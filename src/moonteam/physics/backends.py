@@ -1,0 +1,343 @@
+"""The two engines behind one small interface: same scene, same controllers.
+
+`MjxBackend`: MuJoCo MJX, one jitted scan over control steps, vmapped over worlds; for
+accelerators, and for differentiating or tracing through. `NativeBackend`: C MuJoCo on a
+thread pool with the jitted controllers called in between; the fast one on a CPU.
+
+Letters: B worlds, R robots, T log samples. A control step is CONTROL_PERIOD seconds: every
+controller is called once, then the physics takes its substeps with the controls held.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from mujoco import mjx
+from mujoco.batch import Batch
+
+from moonteam.physics.scene import Scene, SceneRobot
+from moonteam.robots.base import CONTROL_PERIOD, Command
+from moonteam.terrain.surface import Surface
+
+MAX_SPEED = 100.0
+"""Any velocity above this, m/s or rad/s, counts as divergence."""
+
+Controls = tuple[Any, ...]  # one controller state per robot, leaves with leading [B]
+Commands = tuple[Command, ...]  # one per robot, leaves with leading [B]
+
+
+class WorldState(NamedTuple):
+    """All that a simulation needs to go on. Copy it to branch; slice it to pick worlds."""
+
+    time: Array  # [B] s
+    qpos: Array  # [B, nq]
+    qvel: Array  # [B, nv]
+    act: Array  # [B, na] actuator activations
+    warmstart: Array  # [B, nv] the contact solver's last accelerations
+    diverged: Array  # [B] bool: not a number or far too fast; the world is frozen since
+    control: Controls
+
+
+class Log(NamedTuple):
+    """What happened, a sample each `log_every` control steps."""
+
+    qpos: Array  # [B, T, nq] at the end of the sample's interval
+    power: Array  # [B, T, R] W, mean over the interval
+    propellant_rate: Array  # [B, T, R] kg/s, mean over the interval
+
+
+class Backend(Protocol):
+    """An engine that advances B worlds of one scene."""
+
+    name: str
+    scene: Scene
+    log_every: int
+
+    def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
+        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
+        ...
+
+    def advance(
+        self, state: WorldState, commands: Commands, num_control_steps: int
+    ) -> tuple[WorldState, Log]:
+        """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
+        ...
+
+    def compile(self, batch: int, num_control_steps: int) -> float:
+        """Compiles that size of advance; returns the seconds it took."""
+        ...
+
+
+def make_backend(name: str, scene: Scene, *, log_every: int = 5, threads: int = 0) -> Backend:
+    """`mjx` or `native`. Raises ValueError for another name.
+
+    Args:
+      name: which engine.
+      scene: what to simulate.
+      log_every: control steps between two samples of the log.
+      threads: of the native engine; 0 for all CPUs.
+    """
+    if name == "mjx":
+        return MjxBackend(scene, log_every)
+    if name == "native":
+        return NativeBackend(scene, log_every, threads)
+    raise ValueError(f"no backend {name!r}; backends: mjx, native")
+
+
+def hold(scene: Scene, batch: int) -> Commands:
+    """Commands [B] that tell every robot to hold its place."""
+    return tuple(
+        Command(jnp.tile(jnp.asarray(scene.qpos0[r.qpos][:2], jnp.float32), (batch, 1)),
+                jnp.zeros(batch), jnp.zeros(batch, bool))
+        for r in scene.robots)
+
+
+def _substeps(scene: Scene) -> int:
+    """Physics steps in a control step. Raises ValueError unless the one divides the other."""
+    ratio = CONTROL_PERIOD / scene.model.opt.timestep
+    if abs(ratio - round(ratio)) > 1e-6 or ratio < 1:
+        raise ValueError(f"physics step {scene.model.opt.timestep} s must divide "
+                         f"the control period {CONTROL_PERIOD} s")
+    return round(ratio)
+
+
+def _start_controls(robots: Sequence[SceneRobot], qpos: Array, qvel: Array) -> Controls:
+    """Fresh controller states of one world: qpos [nq], qvel [nv]."""
+    return tuple(r.kind.init(qpos[r.qpos], qvel[r.qvel]) for r in robots)
+
+
+def _call_controllers(
+    robots: Sequence[SceneRobot], nu: int, surface: Surface, time: Array, qpos: Array,
+    qvel: Array, controls: Controls, commands: Commands,
+) -> tuple[Array, Controls, Array, Array]:
+    """All controllers of one world: ctrl [nu], their states, power [R], propellant [R]."""
+    ctrl = jnp.zeros(nu)
+    states, power, propellant = [], [], []
+    for robot, memory, command in zip(robots, controls, commands, strict=True):
+        action, memory, told = robot.kind.control(
+            memory, time, qpos[robot.qpos], qvel[robot.qvel], command, surface)
+        ctrl = ctrl.at[robot.ctrl].set(action)
+        states.append(memory)
+        power.append(told.power)
+        propellant.append(told.propellant)
+    return ctrl, tuple(states), jnp.stack(power), jnp.stack(propellant)
+
+
+def _bad(qpos: Array, qvel: Array) -> Array:
+    """Whether a world [..., nq], [..., nv] has blown up: bool [...]."""
+    finite = jnp.isfinite(qpos).all(axis=-1) & jnp.isfinite(qvel).all(axis=-1)
+    return ~finite | (jnp.abs(qvel).max(axis=-1) > MAX_SPEED)
+
+
+def _keep(frozen: Array, old: Any, new: Any) -> Any:
+    """`old` where frozen [] or [B], else `new`, leaf by leaf."""
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(frozen.reshape(frozen.shape + (1,) * (b.ndim - frozen.ndim)), a, b)
+    return jax.tree.map(pick, old, new)
+
+
+def _check_steps(num_control_steps: int, log_every: int) -> None:
+    if num_control_steps < 1 or num_control_steps % log_every:
+        raise ValueError(f"{num_control_steps} control steps are not a multiple of "
+                         f"log_every = {log_every}")
+
+
+class MjxBackend:
+    """MuJoCo MJX. Model and ground are arguments of the compiled function, not constants in
+    it, so sites of one size share a compilation, within a process and in JAX's cache on disk.
+    """
+
+    name = "mjx"
+
+    def __init__(self, scene: Scene, log_every: int = 5):
+        self.scene = scene
+        self.log_every = log_every
+        self._substeps = _substeps(scene)
+        with jax.numpy_rank_promotion("allow"):
+            self._model = mjx.put_model(scene.model)
+            self._blank = mjx.make_data(scene.model)
+        self._advance = jax.jit(self._advance_worlds, static_argnames="num_samples")
+        self._reset = jax.jit(jax.vmap(
+            lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
+
+    def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
+        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
+        return _at_rest(self.scene, self._reset, qpos, batch)
+
+    def advance(
+        self, state: WorldState, commands: Commands, num_control_steps: int
+    ) -> tuple[WorldState, Log]:
+        """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
+        _check_steps(num_control_steps, self.log_every)
+        return self._advance(self._model, self.scene.surface, state, commands,
+                             num_samples=num_control_steps // self.log_every)
+
+    def compile(self, batch: int, num_control_steps: int) -> float:
+        """Compiles that size of advance; returns the seconds it took."""
+        _check_steps(num_control_steps, self.log_every)
+        state, commands = self.reset(batch=batch), hold(self.scene, batch)
+        begun = time.perf_counter()
+        self._advance.lower(self._model, self.scene.surface, state, commands,
+                            num_samples=num_control_steps // self.log_every).compile()
+        return time.perf_counter() - begun
+
+    def _advance_worlds(self, model: mjx.Model, surface: Surface, state: WorldState,
+                        commands: Commands, num_samples: int) -> tuple[WorldState, Log]:
+        def sample(worlds: WorldState, _: None) -> tuple[WorldState, Log]:
+            def step(carry: WorldState, _: None) -> tuple[WorldState, tuple[Array, Array]]:
+                return jax.vmap(self._control_step, in_axes=(None, None, 0, 0))(
+                    model, surface, carry, commands)
+
+            worlds, (power, propellant) = jax.lax.scan(
+                step, worlds, None, length=self.log_every)
+            return worlds, Log(worlds.qpos, power.mean(axis=0), propellant.mean(axis=0))
+
+        state, log = jax.lax.scan(sample, state, None, length=num_samples)
+        return state, jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), log)
+
+    def _control_step(self, model: mjx.Model, surface: Surface, world: WorldState,
+                      commands: Commands) -> tuple[WorldState, tuple[Array, Array]]:
+        """One control step of one world; a diverged world stays as it is."""
+        ctrl, controls, power, propellant = _call_controllers(
+            self.scene.robots, self.scene.model.nu, surface, world.time, world.qpos, world.qvel,
+            world.control, commands)
+        # MJX broadcasts freely; only our own code is held to explicit ranks.
+        with jax.numpy_rank_promotion("allow"):
+            data = self._blank.replace(
+                time=world.time, qpos=world.qpos, qvel=world.qvel, act=world.act,
+                qacc_warmstart=world.warmstart, ctrl=ctrl)
+            for _ in range(self._substeps):
+                data = mjx.step(model, data)
+        bad = _bad(data.qpos, data.qvel)
+        moved = WorldState(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart,
+                           jnp.zeros((), bool), controls)
+        stopped = world._replace(qvel=jnp.zeros_like(world.qvel), diverged=jnp.ones((), bool))
+        frozen = world.diverged | bad
+        return (_keep(frozen, stopped, moved),
+                (_keep(frozen, jnp.zeros_like(power), power),
+                 _keep(frozen, jnp.zeros_like(propellant), propellant)))
+
+
+class NativeBackend:
+    """C MuJoCo: `mujoco.batch` steps the worlds on a thread pool, bit-identical at any number
+    of threads; all controllers of all worlds are one jitted call between.
+    """
+
+    name = "native"
+
+    def __init__(self, scene: Scene, log_every: int = 5, threads: int = 0):
+        self.scene = scene
+        self.log_every = log_every
+        self._threads = threads or os.cpu_count() or 1
+        self._substeps = _substeps(scene)
+        self._batch: Batch | None = None
+        self._reset = jax.jit(jax.vmap(
+            lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
+        self._control = jax.jit(jax.vmap(self._control_world, in_axes=(None, 0, 0, 0, 0, 0)))
+
+    def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
+        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
+        return _at_rest(self.scene, self._reset, qpos, batch)
+
+    def advance(
+        self, state: WorldState, commands: Commands, num_control_steps: int
+    ) -> tuple[WorldState, Log]:
+        """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
+        _check_steps(num_control_steps, self.log_every)
+        worlds = _Worlds(self._pool(state.qpos.shape[0]), state)
+        controls, samples, powers, propellants = state.control, [], [], []
+        for step in range(num_control_steps):
+            ctrl, controls, power, propellant = self._control(
+                self.scene.surface, *worlds.seen(), controls, commands)
+            worlds.step(np.asarray(ctrl), self._substeps)
+            moving = ~worlds.diverged[:, None]
+            powers.append(np.where(moving, power, 0.0))
+            propellants.append(np.where(moving, propellant, 0.0))
+            if (step + 1) % self.log_every == 0:
+                samples.append(worlds.qpos.astype(np.float32))
+        log = Log(jnp.asarray(np.stack(samples, axis=1)), self._means(powers),
+                  self._means(propellants))
+        return worlds.state(controls), log
+
+    def compile(self, batch: int, num_control_steps: int) -> float:
+        """Compiles the controllers for B worlds; returns the seconds it took."""
+        _check_steps(num_control_steps, self.log_every)
+        state = self.reset(batch=batch)
+        begun = time.perf_counter()
+        self._control.lower(self.scene.surface, state.time, state.qpos, state.qvel,
+                            state.control, hold(self.scene, batch)).compile()
+        return time.perf_counter() - begun
+
+    def _control_world(self, surface: Surface, time: Array, qpos: Array, qvel: Array,
+                       controls: Controls, commands: Commands
+                       ) -> tuple[Array, Controls, Array, Array]:
+        return _call_controllers(self.scene.robots, self.scene.model.nu, surface, time, qpos,
+                                 qvel, controls, commands)
+
+    def _pool(self, batch: int) -> Batch:
+        if self._batch is None or self._batch.nsim != batch:
+            self._batch = Batch(self.scene.model, batch, min(self._threads, batch))
+        return self._batch
+
+    def _means(self, rows: list[np.ndarray]) -> Array:
+        """Rows [B, R], one a control step, averaged over each sample: [B, T, R]."""
+        table = np.stack(rows, axis=1)
+        shape = (table.shape[0], -1, self.log_every, table.shape[2])
+        return jnp.asarray(table.reshape(shape).mean(axis=2), jnp.float32)
+
+
+class _Worlds:
+    """The rows of a batch while they are advanced, with the guard against divergence."""
+
+    def __init__(self, batch: Batch, state: WorldState):
+        self._batch = batch
+        self._time, self.qpos = batch.bind("time"), batch.bind("qpos")
+        self._qvel, self._act = batch.bind("qvel"), batch.bind("act")
+        self._warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
+        self._time[:] = np.asarray(state.time).reshape(self._time.shape)
+        self.qpos[:], self._qvel[:] = np.asarray(state.qpos), np.asarray(state.qvel)
+        self._act[:], self._warmstart[:] = np.asarray(state.act), np.asarray(state.warmstart)
+        self.diverged = np.array(state.diverged)
+
+    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Time [B], qpos [B, nq], qvel [B, nv] in the controllers' precision."""
+        return (self._time.astype(np.float32).reshape(-1), self.qpos.astype(np.float32),
+                self._qvel.astype(np.float32))
+
+    def step(self, ctrl: np.ndarray, substeps: int) -> None:
+        """One control step of the worlds that still run; one that blows up goes back to
+        where it was before the step and stays there.
+        """
+        before = self.qpos.copy()
+        self._ctrl[:] = ctrl
+        running = np.flatnonzero(~self.diverged)
+        if running.size:
+            self._batch.step(ids=running, nstep=substeps)
+        bad = ~np.isfinite(self.qpos).all(axis=1) | ~np.isfinite(self._qvel).all(axis=1)
+        bad |= ~(np.abs(self._qvel).max(axis=1) <= MAX_SPEED)
+        self.diverged |= bad
+        self.qpos[bad] = before[bad]
+        self._qvel[bad] = self._warmstart[bad] = 0.0
+
+    def state(self, controls: Controls) -> WorldState:
+        """The worlds as they now are."""
+        arrays = (self._time.reshape(-1), self.qpos, self._qvel, self._act, self._warmstart)
+        return WorldState(*(jnp.asarray(a, jnp.float32) for a in arrays),
+                          jnp.asarray(self.diverged), controls)
+
+
+def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> WorldState:
+    places = np.tile(scene.qpos0, (batch, 1)) if qpos is None else np.asarray(qpos)
+    size, model = len(places), scene.model
+    held = jnp.asarray(places, jnp.float32)
+    still = jnp.zeros((size, model.nv))
+    return WorldState(jnp.zeros(size), held, still, jnp.zeros((size, model.na)), still,
+                      jnp.zeros(size, bool), start(held, still))

@@ -1,0 +1,255 @@
+"""Terrain and robots put together into one MuJoCo model that both engines can step.
+
+The height field carries the ground, spheres carry the boulders (rendered as convex hulls),
+every robot is attached under `name/`. Gravity is the Moon's, there is no air. Contact bits
+are those of `moonteam.robots.base`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from moonteam.errors import InputError
+from moonteam.robots.base import GRAVITY, PHYSICS_DT, RobotKind
+from moonteam.terrain.site import Boulder, Site
+from moonteam.terrain.surface import Surface
+
+FRICTION = 0.75
+"""Sliding friction of regolith: the tangent of its angle of repose, about 37 degrees."""
+
+GEOM = mujoco.mjtGeom
+SHAPES_ON_GROUND = (GEOM.mjGEOM_SPHERE, GEOM.mjGEOM_CAPSULE, GEOM.mjGEOM_BOX, GEOM.mjGEOM_MESH)
+"""What MJX can collide with a height field."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a robot starts: on the ground at `xy` m, heading `yaw` rad from east."""
+
+    name: str
+    kind: RobotKind
+    xy: tuple[float, float]
+    yaw: float = 0.0
+
+
+@dataclass(frozen=True)
+class SceneRobot:
+    """A robot in a scene: its slices of qpos, qvel and ctrl, and its base body's id."""
+
+    name: str
+    kind: RobotKind
+    qpos: slice
+    qvel: slice
+    ctrl: slice
+    body: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled model with all that the backends and the renderer need to know about it."""
+
+    model: mujoco.MjModel
+    robots: tuple[SceneRobot, ...]
+    surface: Surface
+    site: Site
+    qpos0: np.ndarray  # [nq] every robot standing at its start
+
+
+def build_scene(
+    site: Site,
+    placements: Sequence[Placement],
+    *,
+    dt: float = PHYSICS_DT,
+    iterations: int = 4,
+    ls_iterations: int = 8,
+    friction: float = FRICTION,
+) -> Scene:
+    """Compiles a site and robots into a scene.
+
+    Args:
+      site: the ground.
+      placements: the robots, with names that differ.
+      dt: physics step, s.
+      iterations: Newton iterations of the contact solver a step.
+      ls_iterations: line-search iterations within each.
+      friction: sliding friction of ground and boulders.
+
+    Raises:
+      InputError: a start that cannot be: off the site, in a boulder, on too steep ground, on
+        top of another robot.
+    """
+    check_starts(site, placements)
+    spec = mujoco.MjSpec()
+    _set_options(spec, dt, iterations, ls_iterations)
+    _add_ground(spec, site, friction)
+    for index, boulder in enumerate(site.boulders):
+        _add_boulder(spec, index, boulder, friction)
+    for placement in placements:
+        robot = placement.kind.load()
+        spec.worldbody.add_frame().attach_body(
+            robot.body(placement.kind.base), placement.name + "/", "")
+    model = spec.compile()
+    _set_heights(model, site.heights)
+    check_collisions(model)
+    robots = tuple(_find_robot(model, placement) for placement in placements)
+    qpos0 = model.qpos0.copy()
+    for robot, placement in zip(robots, placements, strict=True):
+        qpos0[robot.qpos] = start_pose(site, placement)
+    model.qpos0[:] = qpos0
+    return Scene(model, robots, site.surface, site, qpos0)
+
+
+def start_pose(site: Site, placement: Placement) -> np.ndarray:
+    """The robot's qpos at its start: standing along the ground's normal, joints at home."""
+    kind = placement.kind
+    xy = np.asarray(placement.xy, np.float64)
+    surface = site.surface
+    height, normal = (np.asarray(a, np.float64)
+                      for a in surface.plane(jnp.asarray(xy, jnp.float32), kind.footprint))
+    around = xy[None] + _disc(kind.footprint)
+    ground = np.asarray(surface.height(jnp.asarray(around, jnp.float32)), np.float64)
+    plane = height - (around - xy[None]) @ normal[:2] / normal[2]
+    # Stand clear of the highest bump under the robot; it settles in the first steps.
+    clearance = max(0.0, float(np.max(ground - plane)) * normal[2])
+    position = np.array([*xy, height]) + normal * (kind.spawn_height + clearance)
+    return np.concatenate([position, _align(normal, placement.yaw), kind.home])
+
+
+def check_starts(site: Site, placements: Sequence[Placement]) -> None:
+    """Raises InputError for the first start that cannot be."""
+    for index, placement in enumerate(placements):
+        problem = _start_problem(site, placement, placements[:index])
+        if problem:
+            raise InputError(f"site {site.name}", problem, f"start of robot {placement.name}")
+
+
+def check_collisions(model: mujoco.MjModel) -> None:
+    """Raises ValueError naming the first pair of geoms that MJX could not collide.
+
+    The bits decide which pairs meet; a height field meets only spheres, capsules, boxes and
+    meshes, without contact margin.
+    """
+    from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
+    from mujoco.mjx._src.types import GeomType
+
+    for first, second, _ in geom_pairs(model):
+        types = [GeomType(int(model.geom_type[g])) for g in (first, second)]
+        names = " and ".join(
+            f"{model.geom(g).name or f'geom {g}'} ({t.name.lower()})"
+            for g, t in zip((first, second), types, strict=True))
+        if not has_collision_fn(types[0], types[1]):
+            raise ValueError(f"MJX cannot collide {names}")
+        if types[0] == GeomType.HFIELD and (model.geom_margin[[first, second]] > 0).any():
+            raise ValueError(f"MJX collides height fields without margin: {names}")
+
+
+def _start_problem(site: Site, placement: Placement, others: Sequence[Placement]) -> str:
+    kind, xy = placement.kind, np.asarray(placement.xy, np.float64)
+    where = f"({xy[0]:.2f}, {xy[1]:.2f}) m"
+    if any(abs(v) > half - kind.footprint for v, half in zip(xy, site.extent, strict=True)):
+        return f"{where} is off the site, which reaches to {site.extent[0]:.1f}, " \
+               f"{site.extent[1]:.1f} m"
+    _, normal = site.surface.plane(jnp.asarray(xy, jnp.float32), kind.footprint)
+    slope = math.acos(min(1.0, float(normal[2])))
+    if slope > kind.max_slope:
+        return f"{where} is on a slope of {math.degrees(slope):.0f} degrees; at most " \
+               f"{math.degrees(kind.max_slope):.0f} for {kind.name}"
+    ground = float(site.surface.height(jnp.asarray(xy, jnp.float32)))
+    for boulder in site.boulders:
+        if boulder.reach(ground) + kind.footprint > math.dist(xy, boulder.centre[:2]):
+            return f"{where} is in a boulder of {2 * boulder.radius:.1f} m"
+    for other in others:
+        if math.dist(xy, other.xy) < 0.8 * (kind.footprint + other.kind.footprint):
+            return f"{where} is where robot {other.name} stands"
+    return ""
+
+
+def _set_options(spec: mujoco.MjSpec, dt: float, iterations: int, ls_iterations: int) -> None:
+    option = spec.option
+    option.timestep = dt
+    option.gravity = [0, 0, -GRAVITY]
+    option.density = option.viscosity = 0.0  # no air
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = iterations
+    option.ls_iterations = ls_iterations
+    # A world that blows up must be seen by the guard, not silently put back to the start.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    spec.compiler.degree = False
+    spec.compiler.autolimits = True
+    # Bounds MJX's work where many boulders stand: the nearest pairs and deepest contacts only.
+    spec.add_numeric(name="max_geom_pairs", data=[12])
+
+
+def _add_ground(spec: mujoco.MjSpec, site: Site, friction: float) -> None:
+    rows, columns = site.heights.shape
+    half_x, half_y = site.extent
+    low = float(site.heights.min())
+    spec.add_hfield(name="ground", nrow=rows, ncol=columns,
+                    size=[half_x, half_y, vertical_range(site.heights), 1.0],
+                    userdata=np.zeros(rows * columns))
+    spec.worldbody.add_geom(
+        name="ground", type=GEOM.mjGEOM_HFIELD, hfieldname="ground", pos=[0, 0, low],
+        contype=1, conaffinity=0, condim=3, priority=1, friction=[friction, 0.005, 0.0001],
+        rgba=[0.5, 0.5, 0.5, 1])
+
+
+def vertical_range(heights: np.ndarray) -> float:
+    """The height field's full scale, m: a power of two at least as large as the relief.
+
+    MJX compiles this number in, so a coarse choice lets many sites share one compilation.
+    """
+    return float(2.0 ** math.ceil(math.log2(max(1.0, float(np.ptp(heights))))))
+
+
+def _set_heights(model: mujoco.MjModel, heights: np.ndarray) -> None:
+    """Writes the elevations; the compiler would stretch them to the full scale."""
+    scaled = (heights.astype(np.float64) - float(heights.min())) / vertical_range(heights)
+    model.hfield_data[:] = scaled.astype(np.float32).ravel()
+
+
+def _add_boulder(spec: mujoco.MjSpec, index: int, boulder: Boulder, friction: float) -> None:
+    spec.worldbody.add_geom(
+        name=f"boulder{index}", type=GEOM.mjGEOM_SPHERE, size=[boulder.radius, 0, 0],
+        pos=boulder.centre, contype=3, conaffinity=0, condim=3, priority=1,
+        friction=[friction, 0.005, 0.0001], rgba=[0.4, 0.4, 0.4, 1])
+
+
+def _find_robot(model: mujoco.MjModel, placement: Placement) -> SceneRobot:
+    """The robot's slices. Raises ValueError if its base has no free joint."""
+    prefix = placement.name + "/"
+    body = model.body(prefix + placement.kind.base).id
+    joint = int(model.body_jntadr[body])
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError(f"base {placement.kind.base} of {placement.name} has no free joint")
+    mine = [j for j in range(model.njnt) if model.body_rootid[model.jnt_bodyid[j]] == body]
+    actuators = [a for a in range(model.nu) if model.actuator(a).name.startswith(prefix)]
+    qpos, qvel = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    first = actuators[0] if actuators else 0
+    return SceneRobot(
+        placement.name, placement.kind, slice(qpos, qpos + 6 + len(mine)),
+        slice(qvel, qvel + 5 + len(mine)), slice(first, first + len(actuators)), body)
+
+
+def _disc(radius: float) -> np.ndarray:
+    """Points [n, 2] m that fill a disc about the origin."""
+    steps = np.linspace(-radius, radius, 9)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    return grid[np.linalg.norm(grid, axis=1) <= radius]
+
+
+def _align(normal: np.ndarray, yaw: float) -> np.ndarray:
+    """Unit quaternion wxyz [4]: z along `normal` [3], x towards the heading `yaw`."""
+    x = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    x = x - normal * (x @ normal)
+    x /= np.linalg.norm(x)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.stack([x, np.cross(normal, x), normal], axis=1).ravel())
+    return quat
