@@ -57,8 +57,8 @@ class Gait(NamedTuple):
     heavier robot or another planet needs no other numbers.
     """
 
-    period: float | Array = 0.42  # s
-    duty: float | Array = 0.66  # share of the period that a foot carries
+    period: float | Array = 0.50  # s
+    duty: float | Array = 0.60  # share of the period that a foot carries
     height: float | Array = 0.27  # m, base above the ground plane
     stance: float | Array = 0.175  # m, nominal foothold beside the base
     length: float | Array = 0.20  # m, nominal foothold ahead of or behind the base
@@ -67,7 +67,7 @@ class Gait(NamedTuple):
     follow: float | Array = 1.0  # share of the ground's slope that the body takes on
     speed: float | Array = 0.45  # m/s, most it tries
     slow: float | Array = 0.8  # share of speed lost per unit of slope
-    velocity: float | Array = 5.0  # 1/s, velocity feedback
+    velocity: float | Array = 10.0  # 1/s, velocity feedback
     lift: float | Array = 80.0  # 1/s^2, height feedback
     lift_damping: float | Array = 14.0  # 1/s
     attitude: float | Array = 160.0  # 1/s^2, attitude feedback
@@ -83,7 +83,7 @@ TURN_RATE = 0.7  # rad/s, most it turns
 ACCELERATION = 0.6  # m/s^2, most the wanted velocity changes
 NEAR = 0.35  # m, within it the robot steps sideways or backwards instead of turning
 ARRIVED, LEFT = 0.05, 0.18  # m, stands within the first, walks again beyond the second
-FOOT_MASS = 0.4  # kg, a leg's inertia as felt at the foot
+LEG_INERTIA = np.array([[0.030, 0.0, 0.0], [0.0, 0.031, 0.002], [0.0, 0.002, 0.0166]])  # kg m^2
 
 
 class LeggedState(NamedTuple):
@@ -159,9 +159,10 @@ def control_with(
     state = _guide(gait, state, body, command)
     state, swing, progress = _clock(gait, state, body)
     foothold = _footholds(gait, state, body, swing, progress, surface)
-    forces = _stance_forces(gait, state, body, swing, progress)
-    forces = forces + _swing_forces(gait, state, body, swing, progress, foothold)
-    torque = jnp.einsum("lij,li->lj", body.jacobian, forces).reshape(12)
+    forces = _stance_forces(gait, state, body, swing)
+    torque = jnp.einsum("lij,li->lj", body.jacobian, -forces)
+    torque = torque + _swing_torques(gait, state, body, swing, progress, foothold)
+    torque = torque.reshape(12)
     off = command.lost | (body.rotation[2, 2] < FALLEN)
     torque = jnp.where(off, 0.0, jnp.clip(torque, -TORQUE_LIMIT, TORQUE_LIMIT))
     power = jnp.sum(jnp.maximum(torque * qvel[6:], 0.0))
@@ -259,29 +260,40 @@ def _footholds(
     return jnp.concatenate([place, ground[:, None] + FOOT_RADIUS - 0.005], axis=1)
 
 
-def _swing_forces(
+def _swing_torques(
     gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array, foothold: Array
 ) -> Array:
-    """Force that draws each free foot along its arc [L, 3] N; zero for feet that carry."""
-    s = progress
-    along = s * s * (3.0 - 2.0 * s)
-    rate = 6.0 * s * (1.0 - s) / ((1.0 - gait.duty) * gait.period)
-    start, way = state.grip, foothold - state.grip
-    arc = jnp.maximum(gait.clearance + jnp.maximum(way[:, 2], -way[:, 2]) * 0.5, 0.0)
-    bump, bump_rate = 16.0 * (s * (1 - s)) ** 2, 32.0 * s * (1 - s) * (1 - 2 * s)
-    bump_rate = bump_rate / ((1.0 - gait.duty) * gait.period)
-    target = start + way * along[:, None]
-    target = target.at[:, 2].add(arc * bump)
-    velocity = way * rate[:, None]
-    velocity = velocity.at[:, 2].add(arc * bump_rate)
+    """Joint torques that draw each free foot along its arc [L, J] N m; zero where it carries."""
+    time = (1.0 - gait.duty) * gait.period
+    u = jnp.minimum(progress / 0.85, 1.0)  # there a little before it lands
+    along, rate, change = u * u * (3 - 2 * u), 6 * u * (1 - u) / 0.85, (6 - 12 * u) / 0.85**2
+    change = jnp.where(u < 1.0, change, 0.0)
+    angle = 2 * jnp.pi * progress
+    bump, bump_rate = 0.5 * (1 - jnp.cos(angle)), jnp.pi * jnp.sin(angle)
+    bump_change = 2 * jnp.pi**2 * jnp.cos(angle)
+    way = foothold - state.grip
+    arc = gait.clearance + 0.5 * jnp.abs(way[:, 2])
+    rise = jnp.array([0.0, 0.0, 1.0])[None, :] * arc[:, None]
+    target = state.grip + way * along[:, None] + rise * bump[:, None]
+    velocity = (way * rate[:, None] + rise * bump_rate[:, None]) / time
+    push = (way * change[:, None] + rise * bump_change[:, None]) / time**2
     hanging = ~swing & (body.gap > 0.01)
     target = jnp.where(swing[:, None], target, foothold)
     drop = jnp.array([0.0, 0.0, -0.25])
     velocity = jnp.where(swing[:, None], velocity, drop[None, :] + body.velocity[None, :])
-    stiffness, damping = FOOT_MASS * gait.swing**2, FOOT_MASS * 1.5 * gait.swing
-    pull = stiffness * jnp.clip(target - body.feet, -0.1, 0.1)
-    pull = pull + damping * (velocity - body.foot_velocity)
-    return jnp.where((swing | hanging)[:, None], pull, 0.0)
+    pull = gait.swing**2 * jnp.clip(target - body.feet, -0.1, 0.1)
+    pull = pull + 1.6 * gait.swing * (velocity - body.foot_velocity)
+    pull = pull + jnp.where(swing[:, None], push, 0.0)
+    torque = _inverse(body.jacobian, pull) @ LEG_INERTIA
+    return jnp.where((swing | hanging)[:, None], torque, 0.0)
+
+
+def _inverse(matrix: Array, vector: Array) -> Array:
+    """Solves matrix [L, 3, 3] x = vector [L, 3], damped where the leg is nearly straight."""
+    a, b, c = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+    det = jnp.sum(a * rows[:, 0], axis=1)
+    return jnp.einsum("lij,lj->li", rows, vector) * (det / (det**2 + 1e-6))[:, None]
 
 
 def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
@@ -309,10 +321,8 @@ def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
     return jnp.concatenate([force, moment])
 
 
-def _stance_forces(
-    gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array
-) -> Array:
-    """Force of each carrying foot on the ground [L, 3] N: the wanted wrench, split.
+def _stance_forces(gait: Gait, state: LeggedState, body: _Body, swing: Array) -> Array:
+    """Force of the ground on each carrying foot [L, 3] N: the wanted wrench, split.
 
     min |A f - b|^2_S + |f|^2_(1/w): f = w A^T (A w A^T + S^-1)^-1 b, repeated on what the
     friction cones cut away.
@@ -340,7 +350,7 @@ def _stance_forces(
         share = cho_solve(factor, missing)
         forces = forces + weight[:, None] * jnp.einsum("lij,i->lj", grasp, share)
         forces = _cut(gait, forces, body.normal, weight)
-    return -forces
+    return forces
 
 
 def _cut(gait: Gait, forces: Array, normal: Array, weight: Array) -> Array:
