@@ -83,38 +83,39 @@ def control(
     path = update_path(state.path, qpos[:2], command)
     state = state._replace(path=path)
     landing = command.speed < 0.0
-    down = qpos[2] - surface.height(qpos[:2]) < STANDING_HEIGHT + 0.03
-    wanted = _velocity(state, qpos, qvel, command, surface)
+    ahead = qpos[None, :2] + jnp.array(LOOK_AHEAD)[:, None] * qvel[None, :2]
+    ground = surface.height(ahead)
+    clearance = qpos[2] - ground[0] - STANDING_HEIGHT
+    climb = jnp.max(ground) + CRUISE_HEIGHT - qpos[2]
+    wanted = _velocity(state, qpos, command, clearance, climb)
     force = _acceleration(wanted, qvel[:3]) + jnp.array([0.0, 0.0, GRAVITY])
     thrust = _allocate(*_wrench(state, qpos, qvel, force * MASS))
-    off = command.lost | (landing & down)
+    off = command.lost | (landing & (clearance < 0.03))
     thrust = jnp.where(off, 0.0, jnp.nan_to_num(thrust))
     total = jnp.sum(thrust)
     return thrust, state, Telemetry(0.5 * EXHAUST_SPEED * total, total / EXHAUST_SPEED)
 
 
 def _velocity(
-    state: DroneState, qpos: Array, qvel: Array, command: Command, surface: Surface
+    state: DroneState, qpos: Array, command: Command, clearance: Array, climb: Array
 ) -> Array:
-    """Wanted velocity [3] m/s: along the path, back onto it, and to the right height."""
-    xy, offset = qpos[:2], measure(state.path, qpos[:2])
+    """Wanted velocity [3] m/s: along the path, back onto it, and to the right height.
+
+    `clearance` [] m is that of the feet, `climb` [] m the height missing to cruise.
+    """
+    offset = measure(state.path, qpos[:2])
     landing = command.speed < 0.0
     # Holding and landing have no speed of their own; they need a little to keep their place.
     limit = jnp.where(command.speed > 0.0, jnp.minimum(command.speed, CRUISE_SPEED), 0.5)
     along = braking_speed(offset.remaining, limit, BRAKING, POSITION_GAIN)
     aside = jnp.clip(-POSITION_GAIN * offset.cross, -0.7, 0.7)
     left = jnp.array([-1.0, 1.0]) * offset.direction[::-1]
-    clearance = qpos[2] - surface.height(xy) - STANDING_HEIGHT
     airborne = jnp.clip((clearance - 0.15) / 0.5, 0.0, 1.0)  # no sideways dash at take-off
     sideways = (along * offset.direction + aside * left) * jnp.where(landing, 1.0, airborne)
-
-    ahead = xy[None, :] + jnp.array(LOOK_AHEAD)[:, None] * qvel[None, :2]
-    over_ground = jnp.max(surface.height(ahead)) + CRUISE_HEIGHT - qpos[2]
-    climb = jnp.clip(HEIGHT_GAIN * over_ground, -SINK, CLIMB)
-    over_site = landing & (offset.distance < 0.15)
+    up = jnp.clip(HEIGHT_GAIN * climb, -SINK, CLIMB)
     settle = -jnp.clip(0.6 * clearance, TOUCHDOWN, SINK)
-    climb = jnp.where(over_site, settle, climb)
-    return jnp.concatenate([sideways, climb[None]])
+    up = jnp.where(landing & (offset.distance < 0.15), settle, up)
+    return jnp.concatenate([sideways, up[None]])
 
 
 def _acceleration(wanted: Array, velocity: Array) -> Array:

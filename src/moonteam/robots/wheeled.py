@@ -161,17 +161,19 @@ def _passable(speed: Array, qpos: Array, rotation: Array, surface: Surface) -> A
     """1 on ground it may enter, falling to 0 at CLIMB_LIMIT ahead or TILT_LIMIT now.
 
     Slope is that of the plane through ground points 1.2 m apart, so that roughness does not
-    count as slope; level ground behind it can always be reached by driving the other way.
+    count as slope. A rover that tilts too far may still drive to its lower side.
     """
     forward = rotation[:2, 0] / (jnp.linalg.norm(rotation[:2, 0]) + 1e-6)
     left = jnp.array([-1.0, 1.0]) * forward[::-1]
-    centre = qpos[:2] + 0.5 * jnp.sign(speed) * forward
+    way = jnp.where(speed < 0.0, -1.0, 1.0) * forward
     reach = 0.6
-    points = jnp.stack([forward, -forward, left, -left]) * reach + centre[None, :]
-    z = surface.height(points)
+    points = jnp.stack([forward, -forward, left, -left]) * reach
+    z = surface.height(points + (qpos[:2] + 0.5 * way)[None, :])
     slope = jnp.sqrt((z[0] - z[1]) ** 2 + (z[2] - z[3]) ** 2) / (2.0 * reach)
     ahead = (jnp.tan(CLIMB_LIMIT) - slope) / 0.03
     tilt = (rotation[2, 2] - jnp.cos(TILT_LIMIT)) / 0.03
+    downwards = jnp.sum(way * rotation[:2, 2]) > 0.2
+    tilt = jnp.where(downwards, 1.0, tilt)
     return jnp.clip(jnp.minimum(ahead, tilt), 0.0, 1.0)
 
 
