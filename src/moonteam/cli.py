@@ -64,6 +64,8 @@ def main(argv: list[str] | None = None) -> int:
         module = importlib.import_module(COMMANDS[name][0])
         import tyro
 
+        if hasattr(module, "parse"):  # a command whose first word decides its defaults
+            return module.run(module.parse(rest))
         args = tyro.cli(module.Args, prog=f"moonteam {name}", args=rest,
                         description=inspect.getdoc(module.Args),
                         config=(tyro.conf.FlagCreatePairsOff,))

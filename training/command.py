@@ -1,0 +1,98 @@
+"""`moonteam train PRESET`."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from moonteam import files
+from training import config as configs
+from training.config import Config
+
+
+@dataclass(frozen=True)
+class Args:
+    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's), small, laptop.
+
+    The first word after `train` is the preset; every number of it can be changed by an option.
+
+    Examples:
+      moonteam train small
+      moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50
+      moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50 --resume
+      moonteam train pi_5t --dry-run
+    """
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """The run's numbers, from the preset."""
+    out: Path | None = None
+    """Run folder; runs/PRESET-SEED if not given."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    dry_run: bool = False
+    """Print the numbers, totals, memory and work, train nothing."""
+    json: bool = False
+    """One JSON document on standard output: the report, or the dry run's table."""
+
+
+def parse(words: list[str]) -> Args:
+    """Arguments of the command; the preset's numbers are the defaults of all options.
+
+    Raises InputError for a preset that does not exist.
+    """
+    named = bool(words) and not words[0].startswith("-")
+    asks_help = any(word in ("-h", "--help") for word in words)
+    if not named and not asks_help:
+        configs.preset("" if not words else words[0])
+    name, rest = (words[0], words[1:]) if named else ("small", words)
+    default = Args(configs.preset(name))
+    return tyro.cli(Args, prog=f"moonteam train {name if named else 'PRESET'}", default=default,
+                    args=rest)
+
+
+def run(args: Args) -> int:
+    """Trains, or describes; returns the exit code."""
+    from moonteam.compilation import enable_cache
+
+    enable_cache()
+    if args.dry_run:
+        from training import account
+
+        table = account.describe(args.config)
+        print(files.dump_json(table, 2) if args.json else account.as_text(args.config, table))
+        return 0
+    return _train(args)
+
+
+def _train(args: Args) -> int:
+    from training import loop
+
+    config = args.config
+    out = args.out or Path("runs") / f"{config.name}-{config.seed}"
+    run = loop.Run(config, out, args.resume)
+    say = sys.stderr if args.json else sys.stdout
+    try:
+        with loop.stop_on_signals() as stop:
+            finished = run.train(stop)
+    except loop.Diverged as error:
+        print(f"moonteam: {error}", file=sys.stderr)
+        return 1
+    if not finished:
+        print(f"moonteam: interrupted after update {run.position.total_updates}, saved; go on "
+              f"with --out {out} --resume", file=sys.stderr)
+        return 130
+    report = run.finish()
+    if args.json:
+        print(files.dump_json(report | {"out": str(out), "config": dataclasses.asdict(config)}))
+    for decode in ("argmax", "sample"):
+        score = report[decode]
+        print(f"{decode}: success {score['success']:.3f}, makespan {score['makespan']:.2f}, moves "
+              f"{score['moves']:.2f} on {report['scenarios']} held-out scenarios", file=say)
+    print(f"{report['env_steps']:,} env steps in {report['seconds']:.0f} s; policy, curve and "
+          f"report in {out}", file=say)
+    return 0
