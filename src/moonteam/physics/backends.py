@@ -17,12 +17,11 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
 from mujoco.batch import Batch
 
+from moonteam.physics import mjx
 from moonteam.physics.scene import Scene, SceneRobot
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.terrain.surface import Surface
@@ -144,6 +143,13 @@ def _keep(frozen: Array, old: Any, new: Any) -> Any:
     return jax.tree.map(pick, old, new)
 
 
+def _strong(tree: Any) -> Any:
+    """The same arrays with fixed types, so that a compiled program takes them."""
+    return jax.tree.map(
+        lambda a: jnp.asarray(a, jnp.float32 if jnp.issubdtype(a.dtype, jnp.floating)
+                              else a.dtype), tree)
+
+
 def _check_steps(num_control_steps: int, log_every: int) -> None:
     if num_control_steps < 1 or num_control_steps % log_every:
         raise ValueError(f"{num_control_steps} control steps are not a multiple of "
@@ -164,7 +170,7 @@ class MjxBackend:
         with jax.numpy_rank_promotion("allow"):
             self._model = mjx.put_model(scene.model)
             self._blank = mjx.make_data(scene.model)
-        self._advance = jax.jit(self._advance_worlds, static_argnames="num_samples")
+        self._programs: dict[tuple[int, int], jax.stages.Compiled] = {}
         self._reset = jax.jit(jax.vmap(
             lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
 
@@ -176,18 +182,26 @@ class MjxBackend:
         self, state: WorldState, commands: Commands, num_control_steps: int
     ) -> tuple[WorldState, Log]:
         """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
-        _check_steps(num_control_steps, self.log_every)
-        return self._advance(self._model, self.scene.surface, state, commands,
-                             num_samples=num_control_steps // self.log_every)
+        key = self._key(state.qpos.shape[0], num_control_steps)
+        if key not in self._programs:
+            self.compile(*key)
+        return self._programs[key](self._model, self.scene.surface, _strong(state),
+                                   _strong(commands))
 
     def compile(self, batch: int, num_control_steps: int) -> float:
         """Compiles that size of advance; returns the seconds it took."""
-        _check_steps(num_control_steps, self.log_every)
+        key = self._key(batch, num_control_steps)
         state, commands = self.reset(batch=batch), hold(self.scene, batch)
         begun = time.perf_counter()
-        self._advance.lower(self._model, self.scene.surface, state, commands,
-                            num_samples=num_control_steps // self.log_every).compile()
+        advance = jax.jit(self._advance_worlds, static_argnames="num_samples")
+        self._programs[key] = advance.lower(
+            self._model, self.scene.surface, state, commands,
+            num_samples=num_control_steps // self.log_every).compile()
         return time.perf_counter() - begun
+
+    def _key(self, batch: int, num_control_steps: int) -> tuple[int, int]:
+        _check_steps(num_control_steps, self.log_every)
+        return batch, num_control_steps
 
     def _advance_worlds(self, model: mjx.Model, surface: Surface, state: WorldState,
                         commands: Commands, num_samples: int) -> tuple[WorldState, Log]:
@@ -201,7 +215,7 @@ class MjxBackend:
             return worlds, Log(worlds.qpos, power.mean(axis=0), propellant.mean(axis=0))
 
         state, log = jax.lax.scan(sample, state, None, length=num_samples)
-        return state, jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), log)
+        return _strong(state), jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), log)
 
     def _control_step(self, model: mjx.Model, surface: Surface, world: WorldState,
                       commands: Commands) -> tuple[WorldState, tuple[Array, Array]]:
@@ -214,8 +228,8 @@ class MjxBackend:
             data = self._blank.replace(
                 time=world.time, qpos=world.qpos, qvel=world.qvel, act=world.act,
                 qacc_warmstart=world.warmstart, ctrl=ctrl)
-            for _ in range(self._substeps):
-                data = mjx.step(model, data)
+            data = jax.lax.fori_loop(
+                0, self._substeps, lambda _, d: mjx.step(model, d), data)
         bad = _bad(data.qpos, data.qvel)
         moved = WorldState(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart,
                            jnp.zeros((), bool), controls)
@@ -242,6 +256,7 @@ class NativeBackend:
         self._reset = jax.jit(jax.vmap(
             lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
         self._control = jax.jit(jax.vmap(self._control_world, in_axes=(None, 0, 0, 0, 0, 0)))
+        self._programs: dict[int, jax.stages.Compiled] = {}
 
     def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
         """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
@@ -252,10 +267,14 @@ class NativeBackend:
     ) -> tuple[WorldState, Log]:
         """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
         _check_steps(num_control_steps, self.log_every)
-        worlds = _Worlds(self._pool(state.qpos.shape[0]), state)
-        controls, samples, powers, propellants = state.control, [], [], []
+        batch = state.qpos.shape[0]
+        if batch not in self._programs:
+            self.compile(batch, num_control_steps)
+        control, commands = self._programs[batch], _strong(commands)
+        worlds = _Worlds(self._pool(batch), state)
+        controls, samples, powers, propellants = _strong(state.control), [], [], []
         for step in range(num_control_steps):
-            ctrl, controls, power, propellant = self._control(
+            ctrl, controls, power, propellant = control(
                 self.scene.surface, *worlds.seen(), controls, commands)
             worlds.step(np.asarray(ctrl), self._substeps)
             moving = ~worlds.diverged[:, None]
@@ -272,15 +291,18 @@ class NativeBackend:
         _check_steps(num_control_steps, self.log_every)
         state = self.reset(batch=batch)
         begun = time.perf_counter()
-        self._control.lower(self.scene.surface, state.time, state.qpos, state.qvel,
-                            state.control, hold(self.scene, batch)).compile()
+        self._programs[batch] = self._control.lower(
+            self.scene.surface, state.time, state.qpos, state.qvel, state.control,
+            hold(self.scene, batch)).compile()
         return time.perf_counter() - begun
 
     def _control_world(self, surface: Surface, time: Array, qpos: Array, qvel: Array,
                        controls: Controls, commands: Commands
                        ) -> tuple[Array, Controls, Array, Array]:
-        return _call_controllers(self.scene.robots, self.scene.model.nu, surface, time, qpos,
-                                 qvel, controls, commands)
+        ctrl, controls, power, propellant = _call_controllers(
+            self.scene.robots, self.scene.model.nu, surface, time, qpos, qvel, controls,
+            commands)
+        return ctrl, _strong(controls), power, propellant
 
     def _pool(self, batch: int) -> Batch:
         if self._batch is None or self._batch.nsim != batch:
@@ -329,9 +351,12 @@ class _Worlds:
 
     def state(self, controls: Controls) -> WorldState:
         """The worlds as they now are."""
-        arrays = (self._time.reshape(-1), self.qpos, self._qvel, self._act, self._warmstart)
-        return WorldState(*(jnp.asarray(a, jnp.float32) for a in arrays),
-                          jnp.asarray(self.diverged), controls)
+        def single(rows: np.ndarray) -> Array:
+            return jnp.asarray(rows, jnp.float32)
+
+        return WorldState(
+            single(self._time.reshape(-1)), single(self.qpos), single(self._qvel),
+            single(self._act), single(self._warmstart), jnp.asarray(self.diverged), controls)
 
 
 def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> WorldState:
@@ -340,4 +365,4 @@ def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> W
     held = jnp.asarray(places, jnp.float32)
     still = jnp.zeros((size, model.nv))
     return WorldState(jnp.zeros(size), held, still, jnp.zeros((size, model.na)), still,
-                      jnp.zeros(size, bool), start(held, still))
+                      jnp.zeros(size, bool), _strong(start(held, still)))

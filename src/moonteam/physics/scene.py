@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from moonteam.errors import InputError
+from moonteam.physics import mjx
 from moonteam.robots.base import GRAVITY, PHYSICS_DT, RobotKind
 from moonteam.terrain.site import Boulder, Site
 from moonteam.terrain.surface import Surface
@@ -24,9 +25,6 @@ FRICTION = 0.75
 """Sliding friction of regolith: the tangent of its angle of repose, about 37 degrees."""
 
 GEOM = mujoco.mjtGeom
-SHAPES_ON_GROUND = (GEOM.mjGEOM_SPHERE, GEOM.mjGEOM_CAPSULE, GEOM.mjGEOM_BOX, GEOM.mjGEOM_MESH)
-"""What MJX can collide with a height field."""
-
 
 @dataclass(frozen=True)
 class Placement:
@@ -135,17 +133,14 @@ def check_collisions(model: mujoco.MjModel) -> None:
     The bits decide which pairs meet; a height field meets only spheres, capsules, boxes and
     meshes, without contact margin.
     """
-    from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
-    from mujoco.mjx._src.types import GeomType
-
-    for first, second, _ in geom_pairs(model):
-        types = [GeomType(int(model.geom_type[g])) for g in (first, second)]
+    for first, second, _ in mjx.geom_pairs(model):
+        types = [mjx.GeomType(int(model.geom_type[g])) for g in (first, second)]
         names = " and ".join(
             f"{model.geom(g).name or f'geom {g}'} ({t.name.lower()})"
             for g, t in zip((first, second), types, strict=True))
-        if not has_collision_fn(types[0], types[1]):
+        if not mjx.has_collision_fn(types[0], types[1]):
             raise ValueError(f"MJX cannot collide {names}")
-        if types[0] == GeomType.HFIELD and (model.geom_margin[[first, second]] > 0).any():
+        if types[0] == mjx.GeomType.HFIELD and (model.geom_margin[[first, second]] > 0).any():
             raise ValueError(f"MJX collides height fields without margin: {names}")
 
 
@@ -184,8 +179,11 @@ def _set_options(spec: mujoco.MjSpec, dt: float, iterations: int, ls_iterations:
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    # Bounds MJX's work where many boulders stand: the nearest pairs and deepest contacts only.
-    spec.add_numeric(name="max_geom_pairs", data=[12])
+    # MJX has a row for every contact that could ever be. These bounds keep the nearest pairs
+    # where many boulders stand, and the deepest contacts: enough for all feet and wheels of
+    # three robots, each on two facets.
+    spec.add_numeric(name="max_geom_pairs", data=[8])
+    spec.add_numeric(name="max_contact_points", data=[24])
 
 
 def _add_ground(spec: mujoco.MjSpec, site: Site, friction: float) -> None:

@@ -1,0 +1,289 @@
+"""Straight drives, walks and flights of one robot over a site: does it arrive, and how well?
+
+All traverses of a site run as the worlds of one batch: same scene, each its own start, goal
+and heading. Routes are drawn at random and kept where the kind may go.
+
+Letters: B traverses, T log samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from moonteam.errors import InputError
+from moonteam.physics.backends import make_backend
+from moonteam.physics.scene import Placement, build_scene, check_starts, start_pose
+from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
+from moonteam.terrain.site import Site
+
+ARRIVAL = 0.25  # m from the goal: what the executor calls arrived on cells of 1 m
+FALLEN_TILT, FALLEN_SECONDS = math.radians(60.0), 2.0
+STUCK_PROGRESS, STUCK_SECONDS = 0.3, 20.0  # less than that far in that long
+REST_SECONDS = 3.0  # still watched after the arrival, to see where it comes to rest
+PATIENCE = 4.0  # times the time at the kind's own speed
+LOG_EVERY = 5  # control steps
+MARGIN = 3.0  # m from the site's border
+STEP = 0.25  # m between the points where a route is checked
+DRAWS = 2000
+
+Outcome = Literal["arrived", "fallen", "stuck", "late", "diverged"]
+
+
+@dataclass(frozen=True)
+class Route:
+    """A straight way. `yaw` rad is the heading at the start, drawn at random too."""
+
+    start: tuple[float, float]  # m
+    goal: tuple[float, float]  # m
+    yaw: float
+
+
+@dataclass(frozen=True)
+class Traverse:
+    """One traverse as it went."""
+
+    kind: str
+    site: str
+    site_seed: int
+    start: tuple[float, float]  # m
+    goal: tuple[float, float]  # m
+    yaw: float  # rad
+    outcome: Outcome
+    seconds: float  # until the outcome
+    progress_m: float  # along the line
+    speed_mps: float  # progress over seconds
+    cross_track_rms_m: float
+    cross_track_p95_m: float
+    cross_track_max_m: float
+    rest_error_m: float  # from the goal, REST_SECONDS after arriving; nan where it did not
+    energy_j_per_m: float
+    propellant_g: float
+    tilt_p95_deg: float
+    tilt_max_deg: float
+
+
+def draw_routes(
+    kind: RobotKind, site: Site, count: int, length: float, rng: np.random.Generator
+) -> tuple[list[Route], int]:
+    """`count` passable routes of `length` m, and how many draws it took.
+
+    Raises InputError if the site is too small, or has hardly any.
+    """
+    half = np.array(site.extent) - MARGIN
+    if math.hypot(*(2 * half)) < length or (half <= 0).any():
+        raise InputError(f"site {site.name}", f"too small for {length:g} m traverses", "extent")
+    passable = _passable(kind, site)
+    routes: list[Route] = []
+    for draw in range(1, DRAWS + 1):
+        start = rng.uniform(-half, half)
+        heading, yaw = rng.uniform(-math.pi, math.pi, 2)
+        goal = start + length * np.array([math.cos(heading), math.sin(heading)])
+        route = Route((float(start[0]), float(start[1])), (float(goal[0]), float(goal[1])),
+                      float(yaw))
+        if (np.abs(goal) <= half).all() and passable(route):
+            routes.append(route)
+        if len(routes) == count:
+            return routes, draw
+    raise InputError(f"site {site.name}", f"only {len(routes)} of {count} routes of {length:g} m "
+                     f"that a {kind.name} robot may take in {DRAWS} draws", "site")
+
+
+def _passable(kind: RobotKind, site: Site) -> Callable[[Route], bool]:
+    """Whether slope and boulders along a route are within what the kind can do."""
+    surface = site.surface
+
+    @jax.jit
+    def look(points: Array) -> tuple[Array, Array]:
+        normal = surface.plane(points, kind.footprint)[1]
+        return jnp.arccos(jnp.clip(normal[:, 2], -1.0, 1.0)), surface.height(points)
+
+    def check(route: Route) -> bool:
+        start, goal = np.array(route.start), np.array(route.goal)
+        points = start + np.linspace(0.0, 1.0, _samples(route))[:, None] * (goal - start)
+        slope, ground = (np.asarray(a) for a in look(jnp.asarray(points, jnp.float32)))
+        if slope.max() > kind.max_slope:
+            return False
+        for boulder in site.boulders:
+            near = np.linalg.norm(points - boulder.centre[:2], axis=1)
+            reach = np.array([boulder.reach(float(z)) for z in ground])
+            if ((reach > 0) & (near < reach + kind.footprint + STEP)).any():
+                return False
+        try:
+            check_starts(site, [Placement("robot", kind, route.start, route.yaw)])
+        except InputError:
+            return False
+        return True
+
+    return check
+
+
+def _samples(route: Route) -> int:
+    return math.ceil(math.dist(route.start, route.goal) / STEP) + 1
+
+
+def run_traverses(
+    kind: RobotKind, site: Site, routes: Sequence[Route], *, backend: str = "native",
+    threads: int = 0, watch: Callable[[float], None] = lambda seconds: None,
+) -> list[Traverse]:
+    """Runs all routes at once.
+
+    Args:
+      kind: which robot.
+      site: the ground.
+      routes: where.
+      backend: `native` or `mjx`.
+      threads: of the native backend, 0 for all CPUs.
+      watch: called with the simulated seconds so far.
+    """
+    starts = [Placement("robot", kind, r.start, r.yaw) for r in routes]
+    scene = build_scene(site, starts[:1])
+    engine = make_backend(backend, scene, log_every=LOG_EVERY, threads=threads)
+    state = engine.reset(np.stack([start_pose(site, place) for place in starts]))
+    goals = np.array([r.goal for r in routes], np.float32)
+    command = (Command(jnp.asarray(goals), jnp.full(len(routes), kind.speed),
+                       jnp.zeros(len(routes), bool)),)
+    length = max(math.dist(r.start, r.goal) for r in routes)
+    chunk = round(1.0 / (CONTROL_PERIOD * LOG_EVERY)) * LOG_EVERY
+    judge = _Judge(kind, site, routes)
+    for _ in range(math.ceil(PATIENCE * length / kind.speed)):
+        state, log = engine.advance(state, command, chunk)
+        judge.add(np.asarray(log.qpos), np.asarray(log.power), np.asarray(log.propellant_rate),
+                  np.asarray(state.diverged))
+        watch(judge.seconds)
+        if judge.done:
+            break
+    return judge.verdicts()
+
+
+class _Judge:
+    """Looks at the logs as they come and says when and how each traverse ended."""
+
+    def __init__(self, kind: RobotKind, site: Site, routes: Sequence[Route]):
+        self._kind, self._site, self._routes = kind, site, routes
+        self._start = np.array([r.start for r in routes])  # [B, 2] m
+        self._goal = np.array([r.goal for r in routes])
+        self._period = CONTROL_PERIOD * LOG_EVERY
+        self._ends: list[tuple[Outcome, int] | None] = [None] * len(routes)
+        self._xy: list[np.ndarray] = []
+        self._tilt: list[np.ndarray] = []
+        self._power: list[np.ndarray] = []
+        self._propellant: list[np.ndarray] = []
+
+    @property
+    def seconds(self) -> float:
+        """Simulated so far."""
+        return sum(part.shape[1] for part in self._xy) * self._period
+
+    @property
+    def done(self) -> bool:
+        """Whether every traverse has ended, and those that arrived had time to rest."""
+        now = round(self.seconds / self._period)
+        rest = round(REST_SECONDS / self._period)
+        return all(end is not None and (end[0] != "arrived" or end[1] + rest <= now)
+                   for end in self._ends)
+
+    def add(self, qpos: np.ndarray, power: np.ndarray, propellant: np.ndarray,
+            diverged: np.ndarray) -> None:
+        """A stretch of log: qpos [B, T, nq], power and propellant [B, T, 1]; diverged [B]."""
+        x, y = qpos[..., 4], qpos[..., 5]
+        self._xy.append(qpos[..., :2])
+        self._tilt.append(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))
+        self._power.append(power[..., 0])
+        self._propellant.append(propellant[..., 0])
+        xy, tilt = np.concatenate(self._xy, axis=1), np.concatenate(self._tilt, axis=1)
+        for b, end in enumerate(self._ends):
+            if end is None:
+                self._ends[b] = self._end(xy[b], tilt[b], self._goal[b], bool(diverged[b]))
+
+    def _end(self, xy: np.ndarray, tilt: np.ndarray, goal: np.ndarray, diverged: bool
+             ) -> tuple[Outcome, int] | None:
+        """Outcome and sample of one traverse from all its xy [T, 2] and tilt [T] so far."""
+        if diverged:
+            return "diverged", len(xy)
+        near = np.flatnonzero(np.linalg.norm(xy - goal, axis=1) < ARRIVAL)
+        if near.size:
+            return "arrived", int(near[0]) + 1
+        fallen = round(FALLEN_SECONDS / self._period)
+        if len(tilt) >= fallen and (tilt[-fallen:] > FALLEN_TILT).all():
+            return "fallen", len(xy)
+        stuck = round(STUCK_SECONDS / self._period)
+        if len(xy) > stuck and np.linalg.norm(xy[-1] - xy[-1 - stuck]) < STUCK_PROGRESS:
+            return "stuck", len(xy)
+        return None
+
+    def verdicts(self) -> list[Traverse]:
+        """One row a traverse; what has not ended by now is late."""
+        xy, tilt, power, propellant = (np.concatenate(parts, axis=1) for parts in (
+            self._xy, self._tilt, self._power, self._propellant))
+        return [self._row(b, xy[b], np.degrees(tilt[b]), power[b], propellant[b])
+                for b in range(len(self._routes))]
+
+    def _row(self, b: int, xy: np.ndarray, tilt: np.ndarray, power: np.ndarray,
+             propellant: np.ndarray) -> Traverse:
+        outcome, end = self._ends[b] or ("late", len(xy))
+        line = self._goal[b] - self._start[b]
+        line = line / np.linalg.norm(line)
+        away = xy[:end] - self._start[b]
+        cross = np.abs(line[0] * away[:, 1] - line[1] * away[:, 0])
+        progress, seconds = float(away[-1] @ line), end * self._period
+        rest = xy[min(len(xy), end + round(REST_SECONDS / self._period)) - 1] - self._goal[b]
+        route = self._routes[b]
+        return Traverse(
+            self._kind.name, self._site.name, self._site.seed, route.start, route.goal,
+            route.yaw, outcome, seconds, progress, progress / seconds,
+            cross_track_rms_m=float(np.sqrt(np.mean(cross**2))),
+            cross_track_p95_m=float(np.percentile(cross, 95)),
+            cross_track_max_m=float(cross.max()),
+            rest_error_m=float(np.linalg.norm(rest)) if outcome == "arrived" else math.nan,
+            energy_j_per_m=float(power[:end].sum() * self._period / max(progress, 0.1)),
+            propellant_g=float(propellant[:end].sum() * self._period * 1000.0),
+            tilt_p95_deg=float(np.percentile(tilt[:end], 95)), tilt_max_deg=float(tilt[:end].max()))
+
+
+def summarise(rows: Sequence[Traverse]) -> dict[str, Any]:
+    """Shares with Wilson intervals, means over arrived traverses with bootstrap intervals.
+
+    Intervals are [low, high] at 95 %.
+    """
+    count = len(rows)
+    outcomes = {name: sum(r.outcome == name for r in rows)
+                for name in ("arrived", "fallen", "stuck", "late", "diverged")}
+    summary: dict[str, Any] = {"kind": rows[0].kind, "site": rows[0].site, "count": count}
+    summary |= outcomes
+    summary["arrived_share"] = outcomes["arrived"] / count
+    summary["arrived_interval"] = wilson(outcomes["arrived"], count)
+    arrived = [asdict(r) for r in rows if r.outcome == "arrived"]
+    for key in ("speed_mps", "energy_j_per_m", "propellant_g", "rest_error_m",
+                "cross_track_rms_m", "cross_track_p95_m", "tilt_p95_deg"):
+        values = np.array([r[key] for r in arrived])
+        power = 2 if key == "cross_track_rms_m" else 1
+        summary[key], summary[key.rsplit("_", 1)[0] + "_interval"] = _mean(values, power)
+    summary["cross_track_max_m"] = max((r["cross_track_max_m"] for r in arrived), default=None)
+    summary["tilt_max_deg"] = max((r["tilt_max_deg"] for r in arrived), default=None)
+    return summary
+
+
+def wilson(hits: int, count: int, z: float = 1.96) -> list[float]:
+    """Wilson's score interval [low, high] of a share (Wilson 1927)."""
+    share, weight = hits / count, z * z / count
+    centre = (share + weight / 2) / (1 + weight)
+    half = z / (1 + weight) * math.sqrt(share * (1 - share) / count + weight / (4 * count))
+    return [max(0.0, centre - half), min(1.0, centre + half)]
+
+
+def _mean(values: np.ndarray, power: int) -> tuple[float | None, list[float] | None]:
+    """Power mean of values [n] and its bootstrap interval over traverses, seed 0."""
+    if not values.size:
+        return None, None
+    drawn = np.random.default_rng(0).integers(0, values.size, (2000, values.size))
+    means = np.mean(values[drawn] ** power, axis=1) ** (1.0 / power)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(np.mean(values**power) ** (1.0 / power)), [float(low), float(high)]
