@@ -56,7 +56,6 @@ class Rules:
     fall_s: float = 2.0
     stuck_progress: float = 0.25  # of a leg; a time-out with less counts towards stuck
     stuck_after: int = 2  # such time-outs in a row
-    jump_m: float = 0.5  # in one control step: the engine has reset itself
 
     @property
     def chunk_s(self) -> float:
@@ -65,10 +64,12 @@ class Rules:
 
 
 class Backend(Protocol):
-    """What `run` needs of a physics backend (moonteam.physics.backends)."""
+    """What `run` needs of a physics backend; see moonteam.physics.backends."""
 
-    def reset(self) -> Any:
-        """The worlds at the start."""
+    log_every: int  # control steps between two samples of the log
+
+    def reset(self, qpos: Any = None, batch: int = 1) -> Any:
+        """`batch` worlds at the start; the state's `diverged` is [B] bool."""
         ...
 
     def advance(self, state: Any, commands: tuple[Command, ...],
@@ -86,7 +87,10 @@ class Execution:
         self.mission, self.planner, self.bodies, self.frame = mission, planner, bodies, frame
         self.seed, self.mode, self.rules = seed, mode, rules or Rules()
         self.snapshot = Snapshot.start(scenario)
-        self.snapshot = replace(self.snapshot, solved=np.zeros_like(self.snapshot.solved))
+        # In async mode one robot's move costs the others no decision of their own.
+        self.limit = mission.max_steps * (len(bodies) if mode == "async" else 1)
+        self.snapshot = replace(self.snapshot, solved=np.zeros_like(self.snapshot.solved),
+                                max_steps=self.limit)
         self.record = Record(list(mission.targets),
                              [mission.target_name(j) for j in range(len(mission.targets))])
         self.legs: list[Leg | None] = [None] * len(bodies)
@@ -126,23 +130,27 @@ class Execution:
             out.append((points[i], 0.0 if hold else body.speed, not bool(mask[i])))
         return out
 
-    def observe(self, qpos: npt.NDArray, power: npt.NDArray, propellant: npt.NDArray) -> None:
-        """Takes what happened since the last look: qpos [T, nq], power, propellant [T, R]."""
-        steps = len(qpos)
-        times = self.time + CONTROL_PERIOD * np.arange(1, steps + 1)
+    def observe(self, qpos: npt.NDArray, power: npt.NDArray, propellant: npt.NDArray,
+                period: float = CONTROL_PERIOD) -> None:
+        """Takes what happened since the last look: qpos [T, nq], power, propellant [T, R].
+
+        `period` is the time between two samples, s.
+        """
+        times = self.time + period * np.arange(1, len(qpos) + 1)
         before = self.record.qpos[-1][-1:]
         self.time = float(times[-1])
         self.record.log(times, qpos, power, propellant)
         poses = self._positions(np.concatenate([before, qpos]))  # [T + 1, R, 7]
-        if (np.abs(np.diff(poses[:, :, :2], axis=0)) > self.rules.jump_m).any():
-            self._end("engine", "a robot jumped: the engine could not go on and reset itself")
-            return
-        self._look_for_losses(poses[1:])
+        self._look_for_losses(poses[1:], period * len(qpos))
         if self.finished:
             return
-        self._look_for_arrivals(poses)
+        self._look_for_arrivals(poses, period * len(qpos))
         if self._ready():
             self._decide()
+
+    def diverged(self) -> None:
+        """Ends the mission: the engine could not go on."""
+        self._end("engine", "the physics diverged (not a number, or far too fast)")
 
     def interrupt(self) -> None:
         """Ends the mission where it stands."""
@@ -157,16 +165,16 @@ class Execution:
         """Free joints [T, R, 7] out of qpos [T, nq]."""
         return np.stack([qpos[:, b.base:b.base + 7] for b in self.bodies], axis=1).astype(float)
 
-    def _look_for_losses(self, poses: npt.NDArray) -> None:
+    def _look_for_losses(self, poses: npt.NDArray, seconds: float) -> None:
         """Marks robots that fell, left the map or are not a number; poses [T, R, 7]."""
         last = poses[-1]
-        angle = tilt(poses[:, :, 3:7])  # [T, R]
+        angle: npt.NDArray = tilt(poses[:, :, 3:7])  # [T, R]
         for i in np.flatnonzero(self.snapshot.agent_mask).tolist():
             if not np.isfinite(poses[:, i]).all():
                 self._lose(i, "not_a_number")
                 continue
-            over = bool((angle[:, i] > self.rules.fall_tilt).all())
-            self._tilted_s[i] = self._tilted_s[i] + CONTROL_PERIOD * len(poses) if over else 0.0
+            over = bool(np.min(angle[:, i]) > self.rules.fall_tilt)
+            self._tilted_s[i] = self._tilted_s[i] + seconds if over else 0.0
             if self._tilted_s[i] >= self.rules.fall_s:
                 self._lose(i, "fallen")
             elif self.frame.off_map(last[i, :2]):
@@ -182,10 +190,10 @@ class Execution:
         self._close_leg(robot, "lost")
         self._lost_since = True
 
-    def _look_for_arrivals(self, poses: npt.NDArray) -> None:
+    def _look_for_arrivals(self, poses: npt.NDArray, seconds: float) -> None:
         """Ends the legs of robots that are there, or late; poses [T + 1, R, 7]."""
-        moved = np.hypot(*(poses[-1, :, :2] - poses[0, :, :2]).T)
-        speed = moved / (CONTROL_PERIOD * (len(poses) - 1))
+        moved = poses[-1, :, :2] - poses[0, :, :2]
+        speed: npt.NDArray = np.linalg.norm(moved, axis=-1) / seconds
         seen = np.isfinite(poses[-1, :, :2]).all(-1)
         self._xy = np.where(seen[:, None], poses[-1, :, :2], self._xy)
         for i, leg in enumerate(self.legs):
@@ -240,9 +248,9 @@ class Execution:
             self._end(None, "")
             return
         self._check_solvable()
-        limit = self.mission.max_steps * (len(self.bodies) if self.mode == "async" else 1)
-        if not self.finished and self.decision >= limit:
-            self._end("max_steps", f"{self._open_names()} not solved within {limit} decisions")
+        if not self.finished and self.decision >= self.limit:
+            self._end("max_steps",
+                      f"{self._open_names()} not solved within {self.limit} decisions")
         if self.finished:
             return
         actions = self._ask()
@@ -337,8 +345,10 @@ class Execution:
         self.finished = True
         self.record.success, self.record.failure = failure is None, failure
         self.record.detail = detail
-        for i in range(len(self.legs)):
+        for i, leg in enumerate(self.legs):
             self._close_leg(i, "cut")
+            if leg is not None and leg.end_cell is None:
+                leg.end_cell = _cell(self.frame.settle(self._xy[i], self.snapshot.cells[i]))
 
 
 def _cell(cell: npt.NDArray[np.int32]) -> Cell:
@@ -353,7 +363,8 @@ def run(executions: Sequence[Execution], backend: Backend, qpos: npt.ArrayLike,
     Ctrl-C ends all of them where they stand and is raised again.
     """
     rules = executions[0].rules
-    state = backend.reset()
+    state = backend.reset(batch=len(executions))
+    period = CONTROL_PERIOD * backend.log_every
     for execution in executions:
         execution.start(qpos)
     try:
@@ -361,9 +372,12 @@ def run(executions: Sequence[Execution], backend: Backend, qpos: npt.ArrayLike,
             state, log = backend.advance(state, _stack(executions), rules.chunk_steps)
             poses, power = np.asarray(log.qpos), np.asarray(log.power)
             rate = np.asarray(log.propellant_rate)
+            gone = np.asarray(state.diverged)
             for b, execution in enumerate(executions):
                 if not execution.finished:
-                    execution.observe(poses[b], power[b], rate[b])
+                    execution.observe(poses[b], power[b], rate[b], period)
+                if gone[b] and not execution.finished:
+                    execution.diverged()
             progress()
     except KeyboardInterrupt:
         for execution in executions:

@@ -22,8 +22,8 @@ from sim2grid.replan import grid_problem
 class SlidingPoints:
     """A backend of one world; each robot has a free joint only and slides at its speed.
 
-    `faults`: (robot, from second) -> "still", "tilt", "nan", "slow", "leisurely" or
-    ("drift", vx, vy).
+    `faults`: (robot, from second) -> "still", "tilt", "nan", "slow", "leisurely",
+    "diverge" or ("drift", vx, vy).
     """
 
     start: np.ndarray  # [R, 2] m
@@ -35,11 +35,14 @@ class SlidingPoints:
         qpos[:, 3] = 1.0
         return qpos.ravel()
 
-    def reset(self):
-        return 0.0, self.pose().reshape(-1, 7)
+    log_every = 1
+
+    def reset(self, qpos=None, batch=1):
+        return SimpleNamespace(time=0.0, poses=self.pose().reshape(-1, 7),
+                               diverged=np.zeros(1, bool))
 
     def advance(self, state, commands, num_control_steps):
-        time, poses = state
+        time, poses = state.time, state.poses
         asked = [(np.asarray(c.xy[0]), float(c.speed[0]), bool(c.lost[0])) for c in commands]
         log = []
         for _ in range(num_control_steps):
@@ -50,8 +53,9 @@ class SlidingPoints:
             log.append(poses.ravel())
         flat = np.stack(log)[None]
         ones = np.ones((1, num_control_steps, len(commands)))
-        return (time, poses), SimpleNamespace(qpos=flat, power=10 * ones,
-                                              propellant_rate=0.001 * ones)
+        bad = ("diverge" in [w for (_, since), w in self.faults.items() if time >= since])
+        after = SimpleNamespace(time=time, poses=poses, diverged=np.array([bad]))
+        return after, SimpleNamespace(qpos=flat, power=10 * ones, propellant_rate=0.001 * ones)
 
     def move(self, pose, robot, command, time):
         goal, speed, lost = command

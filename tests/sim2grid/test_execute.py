@@ -141,9 +141,9 @@ def test_events_a_robot_is_lost_and_a_target_appears(mission, execute, script):
     assert len(planner.seen) == 4, "the planner is not asked while nothing is open"
 
 
-def test_an_engine_that_resets_itself_is_noticed(mission, execute, script):
+def test_an_engine_that_cannot_go_on_ends_the_mission(mission, execute, script):
     spec = mission(["a wheeled A 0 0"], ["A OR 3 3"])
-    done = execute(spec, script("right"), faults={(0, 1.0): ("drift", 1e4, 0.0)})
+    done = execute(spec, script("right"), faults={(0, 1.0): "diverge"})
     assert done.record.failure == "engine"
 
 
