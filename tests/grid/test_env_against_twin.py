@@ -162,33 +162,42 @@ many_traces = jax.jit(jax.vmap(trace, in_axes=(None, 0, 0, 0)), static_argnums=0
 
 
 def assert_same(twin, config, num_agents, num_targets, start, results, actions):
-    """Walks the twin through the actions and compares everything after each."""
+    """Walks the twin through the actions and compares all that it saw."""
     n, m = len(twin.positions), len(twin.goals)
-
-    def same_state(cells, solved, observation):
-        assert [tuple(c) for c in cells[:n].tolist()] == twin.positions
-        assert solved.tolist() == [g.solved for g in twin.goals] + [True] * (num_targets - m)
-        wanted = [twin.observe(i, num_agents, num_targets) for i in range(n)]
-        np.testing.assert_allclose(observation[:n], wanted, atol=1e-6)
+    seen = [state_of(twin, num_agents, num_targets)]
+    events = []
+    for joint in actions:
+        rewards, *flags, walked, met = twin.step(joint[:n])
+        seen.append(state_of(twin, num_agents, num_targets))
+        terms = [[*rewards[name], *[0.0] * (num_agents - n)] for name in TERMS]
+        events.append((terms, flags, walked + [False] * (num_agents - n),
+                       met + [False] * (num_targets - m)))
+    positions, solved, observations = (np.array(column) for column in zip(*seen, strict=True))
+    terms, flags, walked, met = (np.array(column) for column in zip(*events, strict=True))
 
     state, observation = start
-    same_state(state.cells, state.solved, observation)
-    weights = config.weights
-    for t, joint in enumerate(actions):
-        r = jax.tree.map(lambda x, t=t: x[t], results)
-        rewards, done, truncated, walked, met = twin.step(joint[:n])
-        same_state(r.state.cells, r.state.solved, r.observation)
-        total = np.zeros(n)
-        for name in TERMS:
-            got = getattr(r.rewards, name)
-            np.testing.assert_allclose(got[:n], rewards[name], rtol=1e-5, atol=1e-9, err_msg=name)
-            assert not np.any(got[n:]), "padding earned a reward"
-            total += getattr(weights, name) * np.array(rewards[name])
-        np.testing.assert_allclose(r.reward[:n], total, rtol=1e-4, atol=1e-7)
-        assert (bool(r.terminated), bool(r.truncated)) == (done, truncated)
-        assert r.true_moves.tolist() == walked + [False] * (num_agents - n)
-        assert r.newly_solved.tolist() == met + [False] * (num_targets - m)
-        assert int(r.state.step) == twin.step_count
+    after = results.state
+    assert np.array_equal(np.concatenate([state.cells[None], after.cells])[:, :n], positions)
+    assert np.array_equal(np.concatenate([state.solved[None], after.solved]), solved)
+    got = np.concatenate([observation[None], results.observation])
+    np.testing.assert_allclose(got[:, :n], observations, atol=1e-6)
+    for k, name in enumerate(TERMS):
+        np.testing.assert_allclose(getattr(results.rewards, name), terms[:, k], rtol=1e-5,
+                                   atol=1e-9, err_msg=name)
+    weights = np.array([getattr(config.weights, name) for name in TERMS])
+    total = (terms * weights[None, :, None]).sum(1)
+    np.testing.assert_allclose(results.reward, total, rtol=1e-4, atol=1e-7)
+    assert np.array_equal(np.stack([results.terminated, results.truncated], 1), flags)
+    assert np.array_equal(results.true_moves, walked)
+    assert np.array_equal(results.newly_solved, met)
+    assert after.step.tolist() == list(range(1, len(actions) + 1))
+
+
+def state_of(twin, num_agents, num_targets):
+    """Positions, solved flags (padding counts as solved) and observations of a moment."""
+    padding = [True] * (num_targets - len(twin.goals))
+    return (list(twin.positions), [g.solved for g in twin.goals] + padding,
+            [twin.observe(i, num_agents, num_targets) for i in range(len(twin.positions))])
 
 
 NUM_AGENTS, NUM_TARGETS, SIDE, HORIZON, BUFFER = 4, 5, 5, 12, 2
@@ -241,12 +250,12 @@ def random_twin(rng, n, m, skills, size, spare, walls, **rules):
 
 
 FAMILIES = {
-    "paper": dict(n=3, m=5, skills=2, size=(8, 8), spare=0, walls=0),
-    "replanning": dict(n=3, m=5, skills=2, size=(6, 6), spare=5, walls=0),
-    "three skills, oblong": dict(n=4, m=6, skills=3, size=(9, 4), spare=0, walls=0),
-    "blocked, one kind an agent": dict(n=2, m=3, skills=2, size=(6, 6), spare=0, walls=8),
-    "alone, raw, literal": dict(n=1, m=2, skills=1, size=(4, 4), spare=0, walls=0,
-                                raw=True, literal=True),
+    "paper": {"n": 3, "m": 5, "skills": 2, "size": (8, 8), "spare": 0, "walls": 0},
+    "replanning": {"n": 3, "m": 5, "skills": 2, "size": (6, 6), "spare": 5, "walls": 0},
+    "three skills, oblong": {"n": 4, "m": 6, "skills": 3, "size": (9, 4), "spare": 0, "walls": 0},
+    "blocked, one kind an agent": {"n": 2, "m": 3, "skills": 2, "size": (6, 6), "spare": 0, "walls": 8},
+    "alone, raw, literal": {"n": 1, "m": 2, "skills": 1, "size": (4, 4), "spare": 0, "walls": 0,
+                                "raw": True, "literal": True},
 }
 
 
