@@ -99,7 +99,7 @@ def build_scene(
     qpos0 = model.qpos0.copy()
     for robot, placement in zip(robots, placements, strict=True):
         qpos0[robot.qpos] = start_pose(site, placement)
-    model.qpos0[:] = qpos0
+    # model.qpos0 stays: it is where joint angles are measured from, not only a start.
     return Scene(model, robots, site.surface, site, qpos0)
 
 
