@@ -18,7 +18,8 @@ from numba import njit
 from moonteam.errors import InputError
 from moonteam.planners import search
 from moonteam.planners.base import IntArray, Objective
-from moonteam.planners.exact import MAX_TARGETS, weights
+from moonteam.planners.exact import MAX_TARGETS
+from moonteam.planners.task import weights
 from moonteam.planners.travel import UNREACHABLE, distance_field
 
 OPTIMAL, FEASIBLE, INFEASIBLE, UNFINISHED = 0, 1, 2, 3
