@@ -1,0 +1,62 @@
+"""Bootstrap intervals of means and of ratios of means.
+
+Every figure of a report is resampled with the same draws, scenario by scenario, so that
+planners on one set are compared on the same resampled sets. Legend: S scenarios, R draws.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+LEVEL = 0.95
+RESAMPLES = 2000
+
+
+class Figure(NamedTuple):
+    """A value and the ends of its interval; not-a-number where nothing was measured."""
+
+    value: float
+    low: float
+    high: float
+
+
+NOTHING = Figure(math.nan, math.nan, math.nan)
+
+
+class Bootstrap:
+    """Percentile bootstrap over S scenarios (Efron and Tibshirani 1993, section 13.3)."""
+
+    def __init__(self, count: int, seed: int, resamples: int = RESAMPLES):
+        self.count = count
+        self.seed = seed
+        self.resamples = resamples
+
+    def mean(self, values: npt.ArrayLike) -> Figure:
+        """The mean of values [S]; not-a-number entries are left out of it."""
+        numbers = np.asarray(values, np.float64)
+        return self.ratio(numbers, np.ones_like(numbers))
+
+    def ratio(self, above: npt.ArrayLike, below: npt.ArrayLike) -> Figure:
+        """Mean of `above` [S] over mean of `below` [S], over the scenarios that have both."""
+        top, bottom = np.asarray(above, np.float64), np.asarray(below, np.float64)
+        known = np.isfinite(top) & np.isfinite(bottom)
+        top, bottom = np.where(known, top, 0.0), np.where(known, bottom, 0.0)
+        if not known.any() or bottom.sum() == 0.0:
+            return NOTHING
+        sums = self._weights @ np.stack([top, bottom], axis=1)  # [R, 2]
+        draws = sums[sums[:, 1] != 0.0]
+        tail = 100 * (1 - LEVEL) / 2
+        low, high = np.percentile(draws[:, 0] / draws[:, 1], [tail, 100 - tail])
+        return Figure(float(top.sum() / bottom.sum()), float(low), float(high))
+
+    @cached_property
+    def _weights(self) -> npt.NDArray[np.float64]:
+        """[R, S] how often each scenario is drawn into each resampled set."""
+        generator = np.random.default_rng([self.seed, self.count])
+        chances = np.full(self.count, 1.0 / self.count)
+        return generator.multinomial(self.count, chances, size=self.resamples).astype(np.float64)

@@ -1,0 +1,239 @@
+"""What stands in a row of a table: a planner with an objective, or a policy with a decoding."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from moonteam.errors import InputError
+from moonteam.evaluation import actors, rollouts
+from moonteam.evaluation import decode as decoding
+from moonteam.evaluation.actors import Loaded
+from moonteam.evaluation.decode import Decode
+from moonteam.evaluation.metrics import Outcomes
+from moonteam.evaluation.progress import track
+from moonteam.evaluation.world import Walk, World, joint_actions, replay, snapshots
+from moonteam.planners import simulate
+from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
+
+OBJECTIVES: dict[str, Objective] = {"makespan": "makespan", "moves": "moves",
+                                    "weighted": "weighted"}
+"""The objectives by the names a user gives."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user asked for, as the commands hand it over; checked by `contenders`."""
+
+    planners: Sequence[str]
+    objectives: Sequence[str] = ("makespan",)
+    policies: Sequence[Path] = ()
+    preferences: Sequence[float] = ()
+    decodes: Sequence[str] = ("argmax",)
+    temperature: float = 1.0
+    alpha: float = 1.0
+    beta: float = 0.05
+    time_limit: float | None = None
+    seed: int = 0
+
+
+class WholePlanner(Protocol):
+    """A planner that can plan a mission to its end, and act where it cannot."""
+
+    def plan(self, snapshot: Snapshot) -> Plan:
+        """A whole plan."""
+        ...
+
+    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
+        """Starts a mission."""
+        ...
+
+    def act(self, snapshot: Snapshot) -> IntArray:
+        """Joint action [N]."""
+        ...
+
+
+class Contender(Protocol):
+    """One row of a table."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the report, such as exact(makespan) or policy(argmax)."""
+        ...
+
+    def check(self, world: World) -> None:
+        """Raises InputError if it cannot serve these scenarios."""
+        ...
+
+    def run(self, world: World) -> Outcomes:
+        """Plans and plays every scenario."""
+        ...
+
+
+def _exact(options: Options, objective: Objective) -> WholePlanner:
+    from moonteam.planners.exact import ExactPlanner
+
+    return ExactPlanner(objective, options.alpha, options.beta, options.time_limit)
+
+
+PLANNERS: dict[str, Callable[[Options, Objective], WholePlanner]] = {
+    "exact": _exact,
+}
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A planner on the host. When a target appears, it plans again."""
+
+    planner: WholePlanner
+    kind: str
+    objective: Objective
+
+    @property
+    def name(self) -> str:
+        """Such as exact(makespan)."""
+        return f"{self.kind}({self.objective})"
+
+    def check(self, world: World) -> None:
+        """The planners say so themselves when they are asked to plan."""
+
+    def run(self, world: World) -> Outcomes:
+        """See `Contender`; plans round by round, a round ends where a target appears."""
+        walk, spent, first_call = world.start, 0.0, 0.0
+        for round_ in range(world.num_buffer + 1):
+            title = f"{self.name} {round_ + 1}" if world.num_buffer else self.name
+            plans, seconds = self._plan_all(world, walk, title, warm=round_ == 0)
+            spent, first_call = spent + sum(seconds[1:]), first_call + seconds[0]
+            walk = replay(world.config, walk, world.horizon, joint_actions(world, plans),
+                          pause=world.num_buffer > 0)
+            if not np.asarray(walk.waiting).any():
+                break
+            walk = Walk(walk.state, walk.moves, walk.waiting & False)
+        return outcomes(self.name, world, walk, spent, first_call)
+
+    def _plan_all(self, world: World, walk: Walk, title: str,
+                  warm: bool) -> tuple[list[IntArray], list[float]]:
+        """Plans for every episode that goes on; seconds of each, the first call's in front."""
+        over = np.asarray(walk.done | (walk.state.step >= world.horizon))
+        moments = snapshots(world, walk)
+        seconds = [0.0]
+        if warm and not over.all():  # what is loaded or compiled at the first call
+            began = time.perf_counter()
+            self._actions(moments[int(np.argmin(over))])
+            seconds[0] = time.perf_counter() - began
+        plans = []
+        for moment, ended in track(zip(moments, over, strict=True), title, len(moments)):
+            began = time.perf_counter()
+            plans.append(self._actions(moment)[:moment.max_steps] if not ended
+                         else np.zeros((0, len(moment.cells)), np.int32))
+            seconds.append(time.perf_counter() - began)
+        return plans, seconds
+
+    def _actions(self, moment: Snapshot) -> IntArray:
+        """The plan's joint actions; where there is none, what the planner does nevertheless."""
+        plan = self.planner.plan(moment)
+        if plan.status != "infeasible":
+            return plan.actions
+        self.planner.reset(moment)
+        done = []
+        while moment.step < moment.max_steps and not moment.solved.all():
+            done.append(self.planner.act(moment))
+            moment = simulate.step(moment, done[-1])
+        return np.array(done, np.int32).reshape(len(done), len(moment.cells))
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A learned policy; best-of-K keeps, of K sampled rollouts, the best by the objective."""
+
+    name: str
+    loaded: Loaded
+    decode: Decode
+    objective: Objective
+    preference: float
+    options: Options
+
+    def check(self, world: World) -> None:
+        """See `Contender`."""
+        self.loaded.actor.check(world, self.loaded.path)
+
+    def run(self, world: World) -> Outcomes:
+        """See `Contender`."""
+        options = self.options
+        tries = rollouts.run(self.loaded, world, self.decode, self.preference,
+                             options.temperature, options.seed, self.name)
+        choice = rollouts.best(tries, self.objective, options.alpha, options.beta)
+        success, steps, moves = (rollouts.picked(v, choice) for v in (
+            tries.success, tries.steps, tries.moves))
+        return Outcomes(self.name, success, steps, moves, tries.seconds, tries.compiling)
+
+
+def outcomes(name: str, world: World, walk: Walk, seconds: float, first_call: float) -> Outcomes:
+    """What the environment says of episodes that were played to their end."""
+    success = np.asarray(walk.done)
+    steps = np.where(success, np.asarray(walk.state.step), np.asarray(world.horizon))
+    return Outcomes(name, success, steps.astype(np.int64), np.asarray(walk.moves, np.int64),
+                    seconds, first_call)
+
+
+def contenders(options: Options) -> list[Contender]:
+    """All rows asked for. Raises InputError at the first wrong name or number."""
+    if not options.planners:
+        raise InputError("--planner", f"at least one is needed: {_known()}")
+    for objective in options.objectives:
+        if objective not in OBJECTIVES:
+            raise InputError("--objective", f"{objective!r} is not one of {', '.join(OBJECTIVES)}")
+    objectives: list[Objective] = [OBJECTIVES[o] for o in dict.fromkeys(options.objectives)]
+    found: list[Contender] = []
+    for planner in dict.fromkeys(options.planners):
+        if planner == "policy":
+            found += _policies(options, objectives)
+        elif planner in PLANNERS:
+            found += [Planned(PLANNERS[planner](options, o), planner, o) for o in objectives]
+        else:
+            raise InputError("--planner", f"{planner!r} is not one of {_known()}")
+    if options.policies and "policy" not in options.planners:
+        raise InputError("--policy", "has no effect without --planner policy")
+    return found
+
+
+def _known() -> str:
+    return ", ".join([*PLANNERS, "policy"])
+
+
+def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contender]:
+    """The rows of every policy file, preference and decoding."""
+    if not options.policies:
+        raise InputError("--policy", "a policy file is needed with --planner policy")
+    if options.temperature <= 0 or not np.isfinite(options.temperature):
+        raise InputError("--temperature", f"{options.temperature} is not allowed; above 0")
+    for preference in options.preferences:
+        if not 0.0 <= preference <= 1.0:
+            raise InputError("--preference", f"{preference} is not allowed; 0 (time) to 1 (effort)")
+    decodes = [decoding.parse(text) for text in dict.fromkeys(options.decodes)]
+    loaded = [actors.load(path) for path in options.policies]
+    found: list[Contender] = []
+    for policy in loaded:
+        stem = "policy" if len(loaded) == 1 else policy.name
+        given = options.preferences if policy.actor.takes_preference else ()
+        for preference in given or (0.0,):
+            for decode in decodes:
+                for objective in objectives if decode.rollouts > 1 else objectives[:1]:
+                    words = [decode.name]
+                    if decode.sample and options.temperature != 1.0:
+                        words.append(f"temperature {options.temperature:g}")
+                    if decode.rollouts > 1 and len(objectives) > 1:
+                        words.append(objective)
+                    if given:
+                        words.append(f"preference {preference:g}")
+                    found.append(Policy(f"{stem}({', '.join(words)})", policy, decode, objective,
+                                        preference, options))
+    names = [one.name for one in found]
+    if len(set(names)) < len(names):
+        raise InputError("--policy", "two policy files have the same name; rename one")
+    return found

@@ -1,0 +1,45 @@
+"""Planners and policies side by side on a set of scenarios."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from moonteam.evaluation import metrics, optima, provenance, report
+from moonteam.evaluation import world as worlds
+from moonteam.evaluation.bootstrap import RESAMPLES, Bootstrap
+from moonteam.evaluation.contenders import Contender
+from moonteam.scenario import Scenario
+
+PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
+          ("moves_gap", "moves over the optimum, %", 100.0),
+          ("success", "success", 1.0))
+COLUMNS = (*report.GRID_COLUMNS, *report.SECONDS)
+
+
+def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int, title: str,
+             command: str) -> dict:
+    """The whole report as a JSON-able document. Raises InputError before anything is run."""
+    world = worlds.build(scenarios)
+    for contender in rows:
+        contender.check(world)
+    found = [contender.run(world) for contender in rows]
+    reference = optima.reference(world.scenarios)
+    return document(world.family, found, reference, seed, title, command)
+
+
+def document(family: metrics.Family, found: Sequence[metrics.Outcomes],
+             reference: metrics.Reference, seed: int, title: str, command: str) -> dict:
+    """Summary, rows, notes and provenance."""
+    bootstrap = Bootstrap(len(family), seed)
+    notes = [f"Measured against: {reference.source}.",
+             f"In brackets: 95 % bootstrap intervals over {len(family)} scenarios, "
+             f"{RESAMPLES} resamples.",
+             metrics.never_failed(found),
+             *(f"{o.planner}: {o.note}" for o in found if o.note)]
+    return {
+        "title": title,
+        "summary": [metrics.summary(o, family, reference, bootstrap) for o in found],
+        "rows": [row for o in found for row in metrics.rows(o, family, reference)],
+        "notes": [note for note in notes if note],
+        "meta": provenance.meta(command, seed),
+    }
