@@ -1,0 +1,158 @@
+"""OR-Tools CP-SAT on the same problem: bounds and cross-checks. The extra `ortools`.
+
+The model: for every target a coalition; for every agent a circuit through its start and the
+targets it visits (the way back costs nothing); a target's time is at least each visitor's
+previous time plus the walk. Makespan is the latest time, moves the sum of the walks.
+
+Legend: N agents, M open targets.
+"""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from moonteam.errors import InputError
+from moonteam.planners.base import IntArray, Objective
+from moonteam.planners.follow import Answer, RoutePlanner
+from moonteam.planners.insertion import coalitions
+from moonteam.planners.large import Weights, best_insertion, improve
+from moonteam.planners.task import Task, weights
+from moonteam.planners.travel import UNREACHABLE
+
+Arc = tuple[int, int, int]
+"""(agent, from, to); place -1 is the agent's start."""
+
+_SCALE = 1000  # CP-SAT counts in integers: weights are rounded to thousandths
+
+
+def _cp_model() -> Any:
+    try:
+        return importlib.import_module("ortools.sat.python.cp_model")
+    except ImportError:
+        raise InputError("--planner cpsat", "OR-Tools is not installed; "
+                         "pip install moonteam[ortools]") from None
+
+
+class CpSatPlanner(RoutePlanner):
+    """Plans and bounds by constraint programming.
+
+    Args:
+      objective: makespan, moves or weighted.
+      alpha: weight of the makespan in the weighted objective, rounded to thousandths.
+      beta: weight of the moves in the weighted objective, rounded to thousandths.
+      time_limit: seconds.
+      workers: threads; one makes the search repeatable while the time suffices.
+    """
+
+    name = "cpsat"
+
+    def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
+                 time_limit: float | None = 10.0, workers: int = 1):
+        super().__init__(objective, alpha, beta)
+        self.time_limit = 10.0 if time_limit is None else time_limit
+        self.workers = workers
+        self._cp = _cp_model()
+
+    def _answer(self, task: Task, began: float) -> Answer:
+        model, arcs, span = self._model(task)
+        moves = sum(way * arc for way, arc in arcs.values())
+        alpha, beta = weights(self.objective, self.alpha, self.beta, len(task.start),
+                              task.horizon)
+        whole = (1, 0) if self.objective == "makespan" else (
+            (0, 1) if self.objective == "moves" else (round(alpha * _SCALE), round(beta * _SCALE)))
+        if max(whole) == 0:
+            raise InputError("--planner cpsat", f"alpha {alpha} and beta {beta} are too small; "
+                             f"they are rounded to {1 / _SCALE}")
+        model.minimize(whole[0] * span + whole[1] * moves)
+        self._hint(model, task, arcs)
+        solver = self._cp.CpSolver()
+        spent = time.perf_counter() - began
+        solver.parameters.max_time_in_seconds = max(0.01, self.time_limit - spent)
+        solver.parameters.num_workers = self.workers
+        status = solver.solve(model)
+        scale = _SCALE if self.objective == "weighted" else 1
+        bound = solver.best_objective_bound / scale
+        if self.objective != "weighted":
+            bound = math.ceil(bound - 1e-6)
+        if status == self._cp.INFEASIBLE:
+            return Answer(None, math.inf, True)
+        if status not in (self._cp.OPTIMAL, self._cp.FEASIBLE):
+            return Answer(None, bound, False)
+        routes = np.full(task.start.shape, -1, np.int32)
+        for a in range(len(task.start)):
+            onward = {i: j for (b, i, j), (_, arc) in arcs.items()
+                      if b == a and i != j and solver.value(arc)}
+            at, place = onward.get(-1, -1), 0
+            while at >= 0:
+                routes[a, place] = at
+                at, place = onward[at], place + 1
+        return Answer(routes, bound, status == self._cp.OPTIMAL)
+
+    def _model(self, task: Task) -> tuple[Any, dict[Arc, tuple[int, Any]], Any]:
+        """The model, its arcs with their steps and literals, and the makespan.
+
+        The arc from a place to itself means "not visited".
+        """
+        model = self._cp.CpModel()
+        agents, count = task.start.shape
+        times = [model.new_int_var(0, task.horizon, f"time{t}") for t in range(count)]
+        span = model.new_int_var(0, task.horizon, "makespan")
+        for moment in times:
+            model.add(span >= moment)
+        arcs: dict[Arc, tuple[int, Any]] = {}
+        visits = [[model.new_bool_var(f"visit{a}_{t}") for t in range(count)]
+                  for a in range(agents)]
+        masks, first = coalitions(task.start, task.skills, task.need, task.both)
+        for t in range(count):
+            teams = masks[first[t]:first[t + 1]].tolist()
+            picked = [model.new_bool_var(f"team{t}_{c}") for c in range(len(teams))]
+            model.add_exactly_one(picked)
+            for a in range(agents):
+                model.add(sum(p for p, team in zip(picked, teams, strict=True) if team >> a & 1)
+                          == visits[a][t])
+        for a in range(agents):
+            self._circuit(model, task, a, visits[a], times, arcs)
+        return model, arcs, span
+
+    def _circuit(self, model: Any, task: Task, agent: int, visits: list, times: list,
+                 arcs: dict[Arc, tuple[int, Any]]) -> None:
+        """One agent's circuit: start, its targets, and back at no cost."""
+        count = len(times)
+        between = task.between[task.kinds[agent]]
+        mine = {}
+        for i in range(-1, count):
+            for j in range(-1, count):
+                literal = model.new_bool_var(f"arc{agent}_{i}_{j}")
+                way = 0
+                if j >= 0 and i != j:
+                    way = int(task.start[agent, j] if i < 0 else between[i, j])
+                if way >= UNREACHABLE:
+                    model.add(literal == 0)
+                    way = 0
+                elif j >= 0 and i != j:
+                    before = 0 if i < 0 else times[i]
+                    model.add(times[j] >= before + way).only_enforce_if(literal)
+                if i == j and i >= 0:
+                    model.add(literal == 1 - visits[i])
+                mine[agent, i, j] = (way, literal)
+        model.add_circuit([(i + 1, j + 1, lit) for (_, i, j), (_, lit) in mine.items()])
+        arcs.update(mine)
+
+    def _hint(self, model: Any, task: Task, arcs: dict[Arc, tuple[int, Any]]) -> None:
+        """Starts the solver from a plan of the large-neighbourhood search."""
+        goal = Weights.of(self.objective, self.alpha, self.beta, task)
+        events = improve(task, goal, best_insertion(task, goal), 0, 500, None)
+        routes: IntArray = events.routes(len(task.start))
+        used = set()
+        for a, route in enumerate(routes.tolist()):
+            places = [-1, *[t for t in route if t >= 0], -1]
+            used |= {(a, i, j) for i, j in itertools.pairwise(places)}
+            used |= {(a, t, t) for t in range(len(task.targets)) if t not in places}
+        for key, (_, literal) in arcs.items():
+            model.add_hint(literal, key in used)
