@@ -1,0 +1,105 @@
+"""The entity network: any size, padding without effect, equivariance, moves that make sense."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from moonteam.grid import env, scenarios
+from moonteam.grid.config import EnvConfig
+from moonteam.grid.travel import problem_fields
+from moonteam.policies.entity import STAY, EntitySpec, decide, init, look, usable
+
+SPEC = EntitySpec(width=16, heads=2, layers=2)
+PARAMS = jax.tree.map(  # biases start at zero; random ones show what they touch
+    lambda x: x + 0.3 * jax.random.normal(jax.random.key(x.size), x.shape),
+    init(SPEC, jax.random.key(0)))
+
+
+def sampled(agents=3, targets=5, seed=0, **counts):
+    config = EnvConfig(num_agents=agents, num_targets=targets, width=12, height=10)
+    return env.reset(config, jax.random.key(seed), **counts)[0]
+
+
+def act(state, preference=0.0, fields=None):
+    return decide(PARAMS, SPEC, look(state, 128, jnp.array(preference), fields))
+
+
+@pytest.mark.parametrize(("agents", "targets"), [(1, 1), (3, 5), (8, 40)])
+def test_one_set_of_weights_takes_any_team(agents, targets):
+    decision = act(sampled(agents, targets))
+    assert decision.log_probs.shape == (agents, 5)
+    np.testing.assert_allclose(jnp.exp(decision.log_probs).sum(-1), 1.0, atol=1e-4)
+
+
+def test_padding_changes_nothing():
+    small = sampled(3, 5)
+    padded = sampled(5, 9, num_agents=3, num_targets=5)
+    problem = replace(
+        padded.problem,
+        agent_skills=padded.problem.agent_skills.at[:3].set(small.problem.agent_skills),
+        target_cells=padded.problem.target_cells.at[:5].set(small.problem.target_cells),
+        target_skills=padded.problem.target_skills.at[:5].set(small.problem.target_skills),
+        target_and=padded.problem.target_and.at[:5].set(small.problem.target_and))
+    padded = replace(padded, problem=problem, cells=padded.cells.at[:3].set(small.cells),
+                     solved=padded.solved.at[:5].set(small.solved))
+    np.testing.assert_allclose(act(padded).log_probs[:3], act(small).log_probs, atol=1e-4)
+
+
+def test_order_of_agents_and_targets_does_not_matter():
+    state = sampled(4, 6)
+    agents, targets = np.array([2, 0, 3, 1]), np.array([5, 3, 1, 0, 2, 4])
+    p = state.problem
+    shuffled = replace(
+        state, cells=state.cells[agents], solved=state.solved[targets],
+        problem=replace(p, agent_skills=p.agent_skills[agents],
+                        target_cells=p.target_cells[targets],
+                        target_skills=p.target_skills[targets],
+                        target_and=p.target_and[targets]))
+    np.testing.assert_allclose(act(shuffled).log_probs, act(state).log_probs[agents], atol=1e-4)
+
+
+def test_only_open_targets_of_shared_skill_are_pointed_at():
+    state = sampled(3, 5, seed=4)
+    state = replace(state, solved=state.solved.at[1].set(True))
+    view = look(state, 128, jnp.zeros(()))
+    pointer = decide(PARAMS, SPEC, view).pointer
+    share = (state.problem.agent_skills[:, None] & state.problem.target_skills[None, :]) != 0
+    wanted = share & ~state.solved[None, :]
+    np.testing.assert_array_equal(usable(view), wanted)
+    np.testing.assert_array_equal(pointer[:, :-1] > -1e8, wanted)
+
+
+def test_moves_shorten_the_way_or_are_rare():
+    state = sampled(3, 5, seed=2)
+    view = look(state, 128, jnp.zeros(()))
+    probs = np.exp(decide(PARAMS, SPEC, view).log_probs)
+    helpful = np.asarray((view.toward & usable(view)[..., None]).any(1))  # [N, 4]
+    assert (probs[:, :STAY][~helpful] <= SPEC.free + 1e-6).all()
+
+
+def test_preference_and_travel_times_reach_the_decision():
+    state = sampled(3, 5)
+    assert not np.allclose(act(state, 0.0).pointer, act(state, 1.0).pointer)
+    made = scenarios.generate(3, num_agents=3, num_targets=4, size=(12, 12),
+                              blocked={"drone": 0.0, "legged": 0.2, "wheeled": 0.3},
+                              kinds=["drone", "legged", "wheeled"])
+    problem, cells = scenarios.to_problem(made)
+    walled = env.reset_to(scenarios.config_for(made), problem, cells)[0]
+    fields = problem_fields(problem)
+    view = look(walled, 128, jnp.zeros(()), fields)
+    assert (np.asarray(view.travel) >= np.abs(
+        np.asarray(problem.target_cells)[None] - np.asarray(cells)[:, None]).sum(-1)).all()
+    # A move that the ground turns back never shortens a way.
+    assert not (np.asarray(view.toward) & ~np.asarray(view.allowed)[:, None]).any()
+    assert np.isfinite(decide(PARAMS, SPEC, view).log_probs).all()
+
+
+def test_open_map_read_by_fields_is_the_same_map():
+    state = sampled(3, 5)
+    free = jnp.ones((1, 10, 12), bool)
+    walled = replace(state, problem=replace(state.problem, passable=free))
+    by_fields = act(walled, fields=problem_fields(walled.problem))
+    np.testing.assert_allclose(by_fields.log_probs, act(state).log_probs, atol=1e-4)

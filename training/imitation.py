@@ -1,0 +1,351 @@
+"""Bootstrap by imitation: DAgger against the exact planner (Ross et al., AISTATS 2011).
+
+The policy acts; the states it comes to are labelled by the oracle with each agent's next
+target; the network learns to point there. So it learns on the states that it itself visits,
+its own mistakes included. Labels depend on the state's preference p between time and effort:
+the oracle minimises (1 - p) * makespan + p * moves, plus a little of both to settle ties.
+
+Legend: E environments of a family, B states of a batch, N agents, M targets, P grounds,
+K kinds, H rows, W columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from moonteam.errors import InputError
+from moonteam.grid import env, scenarios, travel
+from moonteam.grid.config import EnvConfig
+from moonteam.grid.types import State
+from moonteam.planners.batch import solve_batch
+from moonteam.planners.exact import MAX_TARGETS
+from moonteam.policies.entity import Entities, EntitySpec, decide, look
+
+TIE_BREAK = 0.05
+"""Weight that makespan and moves both keep at either end of the preference."""
+
+KINDS = ("drone", "legged", "wheeled")
+
+
+@dataclass(frozen=True)
+class Family:
+    """Problems of one team and target count; maps of all sizes between two."""
+
+    num_agents: int
+    """N."""
+    num_targets: int
+    """M, at most 12: the oracle's limit."""
+    num_skills: int = 2
+    """Skills that exist."""
+    sides: tuple[int, int] = (32, 32)
+    """Smallest and largest side of the square map, cells."""
+    max_steps: int = 128
+    """Horizon of an episode."""
+    grounds: int = 0
+    """P, maps with blocked cells that are drawn from; 0: open maps."""
+
+    @property
+    def config(self) -> EnvConfig:
+        """The grid env at the family's largest map."""
+        return EnvConfig(num_agents=self.num_agents, num_targets=self.num_targets,
+                         num_skills=self.num_skills, width=self.sides[1], height=self.sides[1],
+                         max_steps=self.max_steps)
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """A whole imitation run; every round visits each family once."""
+
+    families: tuple[Family, ...]
+    """What is practised, each round on all of them."""
+    spec: EntitySpec = field(default_factory=EntitySpec)
+    """Size of the network."""
+    rounds: int = 1500
+    """Rounds of visiting, labelling and learning."""
+    num_envs: int = 256
+    """E, environments of each family; as many states are labelled a round."""
+    steps_between: int = 6
+    """Steps that the policy takes between two labelled states."""
+    capacity: int = 65_536
+    """Labelled states kept of each family; the oldest make room."""
+    batch_size: int = 512
+    """States in a gradient step."""
+    batches: int = 2
+    """Gradient steps of each family in a round."""
+    lr: float = 1.5e-3
+    """Learning rate after warm-up; falls to 0 as a cosine."""
+    ema: float = 0.998
+    """Decay of the running mean of the weights, which is what is kept."""
+    seed: int = 0
+    """Seed of everything random in the run."""
+
+    def __post_init__(self) -> None:
+        for i, family in enumerate(self.families):
+            if not 1 <= family.num_targets <= MAX_TARGETS:
+                raise InputError("imitation", f"{family.num_targets} targets; the oracle takes 1 "
+                                 f"to {MAX_TARGETS}", f"families[{i}].num_targets")
+        if self.capacity % self.num_envs:
+            raise InputError("imitation", f"{self.num_envs} environments do not divide "
+                             f"{self.capacity}", "capacity")
+        self.spec.check("imitation")
+
+
+class Ground(NamedTuple):
+    """Problems on maps with blocked cells, made beforehand; empty arrays for open maps."""
+
+    states: State  # [P] at the start, without their maps
+    passable: Array  # [P, K, H, W] bool
+    fields: Array  # [P, K, M, H, W] int16 steps to each target
+
+
+class Walk(NamedTuple):
+    """The environments of one family between two rounds."""
+
+    states: State  # [E]
+    place: Array  # [E] int32, which of the grounds; 0 on open maps
+    preference: Array  # [E]
+    temperature: Array  # [E] of the acting policy; near 0 follows its first choice
+    key: Array
+
+
+class Sample(NamedTuple):
+    """Labelled states; `pointer` is each agent's next target, M for stay."""
+
+    states: State  # [B]
+    place: Array | np.ndarray  # [B] int32
+    preference: Array | np.ndarray  # [B]
+    pointer: Array | np.ndarray  # [B, N] int32
+
+
+class Learner(NamedTuple):
+    """What learning changes."""
+
+    params: Any
+    mean: Any  # running mean of the parameters
+    optimiser: optax.OptState
+
+
+def make_ground(family: Family, seed: int) -> Ground | None:
+    """The family's maps with blocked cells, from a seed; None for open maps.
+
+    Drones cross everything; of the cells, legs are refused up to a fifth and wheels more.
+    """
+    if not family.grounds:
+        return None
+    rng = np.random.default_rng(seed)
+    problems = []
+    for _ in range(family.grounds):
+        legs = float(rng.uniform(0.02, 0.2))
+        blocked = {"drone": 0.0, "legged": legs, "wheeled": legs + float(rng.uniform(0.02, 0.15))}
+        kinds = [KINDS[i % 3] for i in range(family.num_agents)]
+        made = scenarios.generate(
+            rng, num_agents=family.num_agents, num_targets=family.num_targets,
+            num_skills=family.num_skills, size=(family.sides[1], family.sides[1]),
+            max_steps=family.max_steps, blocked=blocked, kinds=kinds)
+        problems.append(scenarios.to_problem(made))
+    problem, cells = scenarios.stack(problems)
+    states = jax.vmap(lambda p, c: env.reset_to(family.config, p, c)[0])(problem, cells)
+    fields = jax.lax.map(lambda p: travel.distance_fields(p.passable, p.target_cells, p.size),
+                         problem, batch_size=32)
+    assert problem.passable is not None
+    bare = replace(states, problem=replace(states.problem, passable=None))
+    return Ground(bare, problem.passable, jnp.minimum(fields, 20_000).astype(jnp.int16))
+
+
+def fresh_episodes(family: Family, ground: Ground | None, key: Array,
+                   count: int) -> tuple[State, Array, Array]:
+    """[count] problems at their start, their grounds, and a preference for each."""
+    size_key, reset_key, wish_key = jax.random.split(key, 3)
+    # A quarter each at the two ends of the preference, the rest in between.
+    wish = jnp.clip(jax.random.uniform(wish_key, (count,), minval=-0.5, maxval=1.5), 0.0, 1.0)
+    if ground is not None:
+        place = jax.random.randint(size_key, (count,), 0, ground.passable.shape[0])
+        return jax.tree.map(lambda x: x[place], ground.states), place, wish
+    low, high = family.sides
+    sides = jax.random.randint(size_key, (count,), low, high + 1)
+    sizes = jnp.stack([sides, sides], axis=-1)
+    keys = jax.random.split(reset_key, count)
+    states, _ = jax.vmap(lambda k, s: env.reset(family.config, k, size=s))(keys, sizes)
+    return states, jnp.zeros(count, jnp.int32), wish
+
+
+def begin(family: Family, ground: Ground | None, key: Array, count: int) -> Walk:
+    """Environments at the start of their episodes; odd ones will act greedily."""
+    first, key = jax.random.split(key)
+    states, place, wish = fresh_episodes(family, ground, first, count)
+    return Walk(states, place, wish, jnp.where(jnp.arange(count) % 2 == 0, 1.0, 0.05), key)
+
+
+def on_ground(ground: Ground | None, states: State, place: Array | np.ndarray) -> State:
+    """The states with their maps."""
+    if ground is None:
+        return states
+    return replace(states, problem=replace(states.problem, passable=ground.passable[place]))
+
+
+def views(family: Family, ground: Ground | None, states: State, place: Array | np.ndarray,
+          preference: Array | np.ndarray) -> Entities:
+    """[B] what the network sees."""
+    whole = on_ground(ground, states, place)
+    if ground is None:
+        return jax.vmap(lambda s, p: look(s, family.max_steps, p))(whole, preference)
+    fields = ground.fields[place].astype(jnp.int32)
+    fields = jnp.where(fields >= 20_000, travel.UNREACHABLE, fields)
+    return jax.vmap(lambda s, p, f: look(s, family.max_steps, p, f))(whole, preference, fields)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def walk_on(spec: EntitySpec, family: Family, steps: int, params: Any, ground: Ground | None,
+            walk: Walk) -> Walk:
+    """The policy takes `steps` steps; ended episodes give way to new ones."""
+
+    def step(walk: Walk, _: None) -> tuple[Walk, None]:
+        act_key, new_key, key = jax.random.split(walk.key, 3)
+        view = views(family, ground, walk.states, walk.place, walk.preference)
+        logits = decide(params, spec, view).log_probs / walk.temperature[:, None, None]
+        actions = jax.random.categorical(act_key, logits)
+        whole = on_ground(ground, walk.states, walk.place)
+        result = jax.vmap(lambda s, a: env.step(family.config, s, a))(whole, actions)
+        ended = result.terminated | result.truncated
+        bare = replace(result.state, problem=replace(result.state.problem, passable=None))
+        fresh = fresh_episodes(family, ground, new_key, ended.shape[0])
+
+        def swap(new: Array, old: Array) -> Array:
+            return jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        states, place, wish = jax.tree.map(swap, fresh, (bare, walk.place, walk.preference))
+        return Walk(states, place, wish, walk.temperature, key), None
+
+    return jax.lax.scan(step, walk, None, steps)[0]
+
+
+def label(ground: Ground | None, walk: Walk, threads: int | None = None) -> Sample:
+    """The walk's states with the oracle's next target for each agent."""
+    states, place, wish = jax.device_get((walk.states, walk.place, walk.preference))
+    problem = states.problem
+    passable = None if ground is None else np.asarray(ground.passable)[place]
+    plans = solve_batch(
+        states.cells, problem.agent_skills, problem.target_cells, problem.target_skills,
+        problem.target_and, solved=states.solved, agent_mask=problem.agent_mask, steps_left=1024,
+        agent_kinds=problem.agent_kinds if ground is not None else None, passable=passable,
+        objective="weighted", alpha=1.0 - wish + TIE_BREAK, beta=wish + TIE_BREAK,
+        threads=threads)
+    num_targets = problem.target_skills.shape[1]
+    pointer = np.where(plans.next_target < 0, num_targets, plans.next_target).astype(np.int32)
+    return Sample(states, place, wish, pointer)
+
+
+def loss(params: Any, spec: EntitySpec, family: Family, ground: Ground | None,
+         batch: Sample) -> Array:
+    """Cross entropy of the pointer, and of the moves that lead where the label points."""
+    view = views(family, ground, batch.states, batch.place, batch.preference)
+    decision = decide(params, spec, view)
+    pick = jax.nn.one_hot(batch.pointer, family.num_targets + 1)
+    pointing = -jnp.sum(jax.nn.log_softmax(decision.pointer) * pick, axis=-1)
+    index = jnp.clip(batch.pointer, 0, family.num_targets - 1)[..., None, None]
+    ways = jnp.take_along_axis(view.toward, index, axis=-2)[..., 0, :]
+    ways = ways & (batch.pointer < family.num_targets)[..., None]
+    good = jnp.concatenate([ways, ~jnp.any(ways, axis=-1, keepdims=True)], axis=-1)
+    moving = -jnp.log(jnp.sum(jnp.exp(decision.log_probs) * good, axis=-1))
+    real = view.agent_mask
+    return jnp.sum((pointing + 0.5 * moving) * real) / jnp.maximum(jnp.sum(real), 1)
+
+
+def optimiser(config: Imitation) -> optax.GradientTransformation:
+    """AdamW with warm-up and a cosine to zero over the whole run."""
+    total = config.rounds * config.batches * len(config.families)
+    rate = optax.warmup_cosine_decay_schedule(0.0, config.lr, min(200, total // 10 + 1), total)
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=1e-4))
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(3,))
+def learn(config: Imitation, family: Family, ground: Ground | None, learner: Learner,
+          batch: Sample) -> tuple[Learner, Array]:
+    """One gradient step on a batch of one family."""
+    value, gradient = jax.value_and_grad(loss)(learner.params, config.spec, family, ground, batch)
+    update, state = optimiser(config).update(gradient, learner.optimiser, learner.params)
+    params = optax.apply_updates(learner.params, update)
+    mean = jax.tree.map(lambda m, p: config.ema * m + (1 - config.ema) * p, learner.mean, params)
+    return Learner(params, mean, state), value
+
+
+class Memory:
+    """The labelled states of one family: a ring, the oldest make room."""
+
+    def __init__(self, capacity: int):
+        """`capacity`: states kept; whole batches of additions must divide it."""
+        self.capacity = capacity
+        self.count = 0
+        self.rows: Sample | None = None
+
+    def add(self, batch: Sample) -> None:
+        """Puts a labelled batch in."""
+        size = len(batch.place)
+        if self.rows is None:
+            self.rows = jax.tree.map(
+                lambda x: np.zeros((self.capacity, *x.shape[1:]), x.dtype), batch)
+        at = self.count % self.capacity
+        for kept, new in zip(jax.tree.leaves(self.rows), jax.tree.leaves(batch), strict=True):
+            kept[at : at + size] = new
+        self.count += size
+
+    def draw(self, rng: np.random.Generator, size: int) -> Sample:
+        """`size` states at random, with replacement."""
+        index = rng.integers(0, min(self.count, self.capacity), size)
+        return jax.tree.map(lambda x: x[index], self.rows)
+
+
+class Round(NamedTuple):
+    """What a round reports."""
+
+    number: int
+    loss: float
+
+
+class Dagger:
+    """An imitation run in progress; `round()` until `done`, `learner.mean` is the policy."""
+
+    def __init__(self, config: Imitation):
+        """Makes grounds, environments and fresh parameters from the config's seed."""
+        from moonteam.policies import entity
+
+        self.config = config
+        self.number = 0
+        keys = jax.random.split(jax.random.key(config.seed), len(config.families) + 1)
+        params = entity.init(config.spec, keys[0])
+        mean = jax.tree.map(jnp.copy, params)
+        self.learner = Learner(params, mean, optimiser(config).init(params))
+        self.grounds = [make_ground(f, config.seed + i) for i, f in enumerate(config.families)]
+        self.walks = [begin(f, g, k, config.num_envs) for f, g, k in
+                      zip(config.families, self.grounds, keys[1:], strict=True)]
+        self.memories = [Memory(config.capacity) for _ in config.families]
+
+    @property
+    def done(self) -> bool:
+        """All rounds are made."""
+        return self.number >= self.config.rounds
+
+    def round(self) -> Round:
+        """Visits, labels and learns, each family once."""
+        config = self.config
+        losses = []
+        for i, family in enumerate(config.families):
+            ground = self.grounds[i]
+            self.walks[i] = walk_on(config.spec, family, config.steps_between,
+                                    self.learner.params, ground, self.walks[i])
+            self.memories[i].add(label(ground, self.walks[i]))
+            rng = np.random.default_rng([config.seed, self.number, i])
+            for _ in range(config.batches):
+                batch = self.memories[i].draw(rng, config.batch_size)
+                self.learner, value = learn(config, family, ground, self.learner, batch)
+                losses.append(value)
+        self.number += 1
+        return Round(self.number, float(jnp.mean(jnp.stack(losses))))
