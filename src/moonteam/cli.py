@@ -29,6 +29,7 @@ COMMANDS = {
     "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
     "bench train": ("training.bench", "training throughput"),
     "bench physics": ("moonteam.commands.bench_physics", "physics steps per second"),
+    "testsets": ("moonteam.commands.testsets", "make the scenario sets, with their optima"),
     "doctor": ("moonteam.commands.doctor", "what this machine can do"),
 }
 

@@ -1,0 +1,211 @@
+"""`moonteam testsets`: the scenario sets that every result is measured on, with their optima."""
+
+from __future__ import annotations
+
+import json
+import sys
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from moonteam import files
+from moonteam.errors import InputError
+from moonteam.scenario import Optimal, Scenario, save_set
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one set is drawn; the map is 32 x 32 cells, an episode 128 steps at most."""
+
+    agents: int
+    targets: int
+    count: int
+    skills: int = 2
+    blocked: dict[str, float] | None = None  # share of the map each kind cannot enter
+    certified: bool = True  # optima by the exact planner; else best known and a bound
+
+    def name(self) -> str:
+        """File name without suffix, e.g. 3x5, 4x6-3skills, 3x6-blocked."""
+        return (f"{self.agents}x{self.targets}" + (f"-{self.skills}skills" if self.skills != 2
+                else "") + ("-blocked" if self.blocked else ""))
+
+
+GROUND = {"drone": 0.0, "legged": 0.12, "wheeled": 0.25}
+
+RECIPES = (
+    Recipe(3, 5, 1000), Recipe(3, 6, 1000), Recipe(3, 7, 1000),
+    Recipe(2, 3, 200), Recipe(2, 8, 200), Recipe(3, 10, 200), Recipe(3, 12, 200),
+    Recipe(4, 8, 200), Recipe(5, 5, 200), Recipe(5, 10, 200), Recipe(6, 12, 200),
+    Recipe(4, 6, 200, skills=3), Recipe(5, 8, 200, skills=3),
+    Recipe(3, 6, 200, blocked=GROUND),
+    Recipe(5, 20, 100, certified=False), Recipe(8, 40, 100, certified=False),
+)
+NAMES = tuple(recipe.name() for recipe in RECIPES)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Makes the test sets, one .jsonl file each, with index.json that tells how.
+
+    Every scenario can be solved within its 128 steps; draws that cannot are drawn again.
+    Optima are those of the exact planner, makespan and moves each on its own and within 128
+    steps. The sets too large for it hold the best values known (large-neighbourhood search
+    with --iterations, from several starts) and lower bounds.
+
+    Examples:
+      moonteam testsets --out assets/testsets --seed 0
+      moonteam testsets --out /tmp/sets --sets 3x5 3x6-blocked --count 20
+    """
+
+    out: Path
+    """Folder to write to."""
+
+    seed: int = 0
+    """Seed of the draws; each set has its own stream."""
+
+    sets: tuple[str, ...] = NAMES
+    """Which sets to make."""
+
+    count: int | None = None
+    """Scenarios a set; default: 1000, 200 or 100 as the set asks."""
+
+    iterations: int = 30_000
+    """Large-neighbourhood iterations for each objective and start of the large sets."""
+
+    starts: int = 2
+    """Starts of the large-neighbourhood search."""
+
+    json: bool = field(default=False)
+    """Print the index as one JSON document."""
+
+
+def draws(recipe: Recipe, seed: int) -> Iterator[Scenario]:
+    """Endless scenarios of a set, not yet checked for time."""
+    import numpy as np
+
+    from moonteam.grid.scenarios import generate
+
+    rng: np.random.Generator = np.random.default_rng([seed, zlib.crc32(recipe.name().encode())])
+    while True:
+        yield generate(rng, num_agents=recipe.agents, num_targets=recipe.targets,
+                       num_skills=recipe.skills, blocked=recipe.blocked)
+
+
+def certify(scenario: Scenario) -> Optimal | None:
+    """Both optima by the exact planner; None if 128 steps are too few."""
+    from moonteam.planners.base import Snapshot
+    from moonteam.planners.exact import ExactPlanner
+
+    snapshot = Snapshot.start(scenario)
+    fastest = ExactPlanner("makespan").plan(snapshot)
+    if fastest.status == "infeasible":
+        return None
+    return Optimal(makespan=fastest.makespan, moves=ExactPlanner("moves").plan(snapshot).moves)
+
+
+def best_known(scenario: Scenario, iterations: int, starts: int) -> Optimal | None:
+    """Best values of large-neighbourhood searches, and lower bounds; None if unsolved."""
+    from moonteam.planners.base import Snapshot
+    from moonteam.planners.bounds import lower_bounds
+    from moonteam.planners.large import LnsPlanner
+    from moonteam.planners.task import Task
+    from moonteam.planners.travel import travel_times
+
+    snapshot = Snapshot.start(scenario)
+    low_makespan, low_moves = lower_bounds(Task.of(snapshot, travel_times(snapshot)), parts=4)
+    plans = {objective: [LnsPlanner(objective, iterations=iterations, seed=s).plan(snapshot)
+                         for s in range(starts)] for objective in ("makespan", "moves")}
+    everything = [plan for some in plans.values() for plan in some]
+    makespans = [plan.makespan for plan in everything if plan.makespan is not None]
+    moves = [plan.moves for plan in everything if plan.moves is not None]
+    if not makespans:
+        return None
+    return Optimal(best_makespan=min(makespans), best_moves=min(moves),
+                   bound_makespan=low_makespan, bound_moves=low_moves)
+
+
+def make(recipe: Recipe, args: Args, tick) -> list[Scenario]:
+    """One set; `tick(done)` is told about progress."""
+    from moonteam.planners.batch import cores
+
+    wanted = args.count or recipe.count
+    source, found = draws(recipe, args.seed), []
+
+    def judge(scenario: Scenario) -> Optimal | None:
+        if recipe.certified:
+            return certify(scenario)
+        return best_known(scenario, args.iterations, args.starts)
+
+    with ThreadPoolExecutor(cores()) as pool:
+        while len(found) < wanted:
+            batch = [next(source) for _ in range(min(wanted - len(found), 50))]
+            for scenario, optimal in zip(batch, pool.map(judge, batch), strict=True):
+                if optimal is not None:
+                    name = f"{recipe.name()}-{len(found):04d}"
+                    found.append(msgspec.structs.replace(scenario, id=name, optimal=optimal))
+            tick(len(found))
+    return found
+
+
+def run(args: Args) -> int:
+    """Makes the sets asked for; returns 0."""
+    unknown = [name for name in args.sets if name not in NAMES]
+    if unknown:
+        raise InputError("--sets", f"{unknown[0]!r} is not allowed; " + ", ".join(NAMES))
+    for option, value in (("--count", args.count), ("--iterations", args.iterations),
+                          ("--starts", args.starts)):
+        if value is not None and value < 1:
+            raise InputError(option, f"{value} is not allowed; at least 1")
+    if args.seed < 0:
+        raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    index_path = args.out / "index.json"
+    index = json.loads(files.read_text(index_path)) if index_path.exists() else {}
+    with Progress(console=console, disable=not sys.stderr.isatty()) as progress:
+        for recipe in RECIPES:
+            if recipe.name() not in args.sets:
+                continue
+            bar = progress.add_task(recipe.name(), total=args.count or recipe.count)
+            scenarios = make(recipe, args, lambda n, b=bar: progress.update(b, completed=n))
+            save_set(args.out / f"{recipe.name()}.jsonl", scenarios)
+            index[recipe.name()] = describe(recipe, args, scenarios)
+            files.write_json(index_path, dict(sorted(index.items())))
+            if not args.json:
+                print(summary(recipe.name(), index[recipe.name()]), flush=True)
+    if args.json:
+        print(files.dump_json(index))
+    return 0
+
+
+def describe(recipe: Recipe, args: Args, scenarios: list[Scenario]) -> dict:
+    """What index.json says about a set."""
+    entry: dict = {
+        "agents": recipe.agents, "targets": recipe.targets, "skills": recipe.skills,
+        "size": [32, 32], "max_steps": scenarios[0].max_steps, "count": len(scenarios),
+        "seed": args.seed, "blocked": recipe.blocked,
+        "optima": "exact" if recipe.certified else
+        f"best of {args.starts} x {args.iterations} iterations of lns, with lower bounds"}
+    for key in ("makespan", "moves", "best_makespan", "best_moves", "bound_makespan",
+                "bound_moves"):
+        values = [getattr(s.optimal, key) for s in scenarios]
+        if values[0] is not None:
+            entry[f"mean_{key}"] = round(sum(values) / len(values), 3)
+    return entry
+
+
+def summary(name: str, entry: dict) -> str:
+    """One line about a set."""
+    means = ", ".join(f"{key[5:].replace('_', ' ')} {value}" for key, value in entry.items()
+                      if key.startswith("mean_"))
+    return f"{name}: {entry['count']} scenarios; means: {means}"
