@@ -64,10 +64,12 @@ class Gait(NamedTuple):
     length: float | Array = 0.20  # m, nominal foothold ahead of or behind the base
     clearance: float | Array = 0.07  # m, swing arc above the higher of its ends
     catch: float | Array = 0.12  # s, foothold moved per unit of velocity error
+    lean: float | Array = 0.0  # m, footholds moved uphill per unit of slope
     follow: float | Array = 1.0  # share of the ground's slope that the body takes on
     speed: float | Array = 0.45  # m/s, most it tries
     slow: float | Array = 0.8  # share of speed lost per unit of slope
     velocity: float | Array = 10.0  # 1/s, velocity feedback
+    push: float | Array = 0.8  # most that velocity feedback asks for, in weights
     lift: float | Array = 80.0  # 1/s^2, height feedback
     lift_damping: float | Array = 14.0  # 1/s
     attitude: float | Array = 160.0  # 1/s^2, attitude feedback
@@ -224,7 +226,7 @@ def _clock(gait: Gait, state: LeggedState, body: _Body) -> tuple[LeggedState, Ar
     The clock rests where all feet carry while nothing is asked and the feet stand well.
     """
     asked = jnp.linalg.norm(state.wanted * jnp.array([1.0, 1.0, 0.25])) > 0.02
-    nominal = body.at[:2][None, :] + _nominal(gait) @ body.level.T
+    nominal = _nominal(gait) @ body.level.T + (body.at[:2] + gait.lean * body.gradient)[None, :]
     astray = jnp.max(jnp.linalg.norm(body.feet[:, :2] - nominal, axis=1)) > 0.08
     pushed = jnp.linalg.norm(body.velocity[:2]) > 0.15
     offsets = jnp.asarray(LEG_OFFSETS)
@@ -243,7 +245,7 @@ def _footholds(
     gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array, surface: Surface
 ) -> Array:
     """Where each foot's centre is to land [L, 3] m."""
-    hips = _nominal(gait) @ body.level.T  # [L, 2] from the base
+    hips = _nominal(gait) @ body.level.T + gait.lean * body.gradient[None, :]  # [L, 2]
     turned = jnp.stack([-hips[:, 1], hips[:, 0]], axis=1)
     wanted = state.wanted[None, :2] + state.wanted[2] * turned
     velocity = body.velocity[None, :2] + body.spin[2] * turned
@@ -301,14 +303,14 @@ def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
     gradient = gait.follow * body.gradient
     up = jnp.concatenate([-gradient, jnp.ones(1)])
     up = up / jnp.linalg.norm(up)
-    feet = jnp.mean(body.feet[:, :2], axis=0) - body.at[:2]
+    feet = jnp.mean(body.feet[:, :2], axis=0) - body.at[:2] - gait.lean * body.gradient
     ends = jnp.sum(body.feet[:, :2] * END[:, None], axis=0) / 2.0
     local = body.level.T @ ends
     standing = jnp.linalg.norm(state.wanted) < 0.01
     yaw = jnp.where(standing, jnp.arctan2(local[1], local[0]), 0.0)
     push = gait.velocity * (state.wanted[:2] - body.velocity[:2])
     push = push + jnp.where(standing, 8.0 * feet, 0.0)
-    push = push / jnp.maximum(1.0, jnp.linalg.norm(push) / (0.6 * GRAVITY))
+    push = push / jnp.maximum(1.0, jnp.linalg.norm(push) / (gait.push * GRAVITY))
     rise = body.ground + gait.height - body.at[2]
     climb = body.gradient @ body.velocity[:2] - body.velocity[2]
     lift = GRAVITY + gait.lift * jnp.clip(rise, -0.05, 0.05) + gait.lift_damping * climb
