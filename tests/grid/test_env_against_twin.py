@@ -253,9 +253,9 @@ FAMILIES = {
     "paper": {"n": 3, "m": 5, "skills": 2, "size": (8, 8), "spare": 0, "walls": 0},
     "replanning": {"n": 3, "m": 5, "skills": 2, "size": (6, 6), "spare": 5, "walls": 0},
     "three skills, oblong": {"n": 4, "m": 6, "skills": 3, "size": (9, 4), "spare": 0, "walls": 0},
-    "blocked, one kind an agent": {"n": 2, "m": 3, "skills": 2, "size": (6, 6), "spare": 0, "walls": 8},
+    "a kind an agent": {"n": 2, "m": 3, "skills": 2, "size": (6, 6), "spare": 0, "walls": 8},
     "alone, raw, literal": {"n": 1, "m": 2, "skills": 1, "size": (4, 4), "spare": 0, "walls": 0,
-                                "raw": True, "literal": True},
+                            "raw": True, "literal": True},
 }
 
 
