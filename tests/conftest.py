@@ -1,4 +1,4 @@
-"""What every test shares: strict JAX, and the tests' own compilation cache."""
+"""What every test shares: strict JAX, and what was compiled once is kept."""
 
 import os
 
@@ -7,4 +7,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 
+from moonteam.compilation import enable_cache
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
+enable_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -1,6 +1,7 @@
 """The entity network: any size, padding without effect, equivariance, moves that make sense."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +14,30 @@ from moonteam.grid.travel import problem_fields
 from moonteam.policies.entity import STAY, EntitySpec, decide, init, look, usable
 
 SPEC = EntitySpec(width=16, heads=2, layers=2)
-PARAMS = jax.tree.map(  # biases start at zero; random ones show what they touch
-    lambda x: x + 0.3 * jax.random.normal(jax.random.key(x.size), x.shape),
-    init(SPEC, jax.random.key(0)))
 
 
+@jax.jit
+def noisy_params():
+    """Biases start at zero; random ones show what they touch."""
+    return jax.tree.map(lambda x: x + 0.3 * jax.random.normal(jax.random.key(x.size), x.shape),
+                        init(SPEC, jax.random.key(0)))
+
+
+PARAMS = noisy_params()
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def sampled(agents=3, targets=5, seed=0, **counts):
     config = EnvConfig(num_agents=agents, num_targets=targets, width=12, height=10)
     return env.reset(config, jax.random.key(seed), **counts)[0]
 
 
+@jax.jit
 def act(state, preference=0.0, fields=None):
-    return decide(PARAMS, SPEC, look(state, 128, jnp.array(preference), fields))
+    return decide(PARAMS, SPEC, look(state, 128, jnp.asarray(preference), fields))
+
+
+see = jax.jit(lambda state, fields=None: look(state, 128, jnp.zeros(()), fields))
 
 
 @pytest.mark.parametrize(("agents", "targets"), [(1, 1), (3, 5), (8, 40)])
@@ -64,8 +77,7 @@ def test_order_of_agents_and_targets_does_not_matter():
 def test_only_open_targets_of_shared_skill_are_pointed_at():
     state = sampled(3, 5, seed=4)
     state = replace(state, solved=state.solved.at[1].set(True))
-    view = look(state, 128, jnp.zeros(()))
-    pointer = decide(PARAMS, SPEC, view).pointer
+    view, pointer = see(state), act(state).pointer
     share = (state.problem.agent_skills[:, None] & state.problem.target_skills[None, :]) != 0
     wanted = share & ~state.solved[None, :]
     np.testing.assert_array_equal(usable(view), wanted)
@@ -74,8 +86,7 @@ def test_only_open_targets_of_shared_skill_are_pointed_at():
 
 def test_moves_shorten_the_way_or_are_rare():
     state = sampled(3, 5, seed=2)
-    view = look(state, 128, jnp.zeros(()))
-    probs = np.exp(decide(PARAMS, SPEC, view).log_probs)
+    view, probs = see(state), np.exp(act(state).log_probs)
     helpful = np.asarray((view.toward & usable(view)[..., None]).any(1))  # [N, 4]
     assert (probs[:, :STAY][~helpful] <= SPEC.free + 1e-6).all()
 
@@ -89,12 +100,12 @@ def test_preference_and_travel_times_reach_the_decision():
     problem, cells = scenarios.to_problem(made)
     walled = env.reset_to(scenarios.config_for(made), problem, cells)[0]
     fields = problem_fields(problem)
-    view = look(walled, 128, jnp.zeros(()), fields)
+    view = see(walled, fields)
     assert (np.asarray(view.travel) >= np.abs(
         np.asarray(problem.target_cells)[None] - np.asarray(cells)[:, None]).sum(-1)).all()
     # A move that the ground turns back never shortens a way.
     assert not (np.asarray(view.toward) & ~np.asarray(view.allowed)[:, None]).any()
-    assert np.isfinite(decide(PARAMS, SPEC, view).log_probs).all()
+    assert np.isfinite(act(walled, 0.0, fields).log_probs).all()
 
 
 def test_open_map_read_by_fields_is_the_same_map():
