@@ -10,14 +10,17 @@ from __future__ import annotations
 import functools
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 
 from moonteam.errors import InputError
 from moonteam.mission import Mission
+from moonteam.terrain import generate
 from moonteam.terrain.surface import Surface
 
 SPACING = 0.25
@@ -25,6 +28,13 @@ SPACING = 0.25
 
 MARGIN = 4.0
 """Ground kept around a mission's map, m, so that a robot at the edge still stands on some."""
+
+
+MAX_SAMPLES = 1_500_000
+"""Largest number of elevation samples in a site."""
+
+MAX_MISSING = 0.05
+"""Largest share of an elevation model's window without data."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +81,26 @@ class Site:
 def make_site(
     preset: str, seed: int, extent_m: float | tuple[float, float], spacing: float = SPACING
 ) -> Site:
-    """Ground of a preset: `generate.PRESETS` (mare, highland, crater_rim, polar) or flat.
+    """Ground of a preset: one of `generate.PRESETS` (mare, highland, crater_rim, polar), or flat.
 
     The same arguments give the same site to the bit. `extent_m`: side, or (x, y) sides.
     Raises InputError for an unknown preset or a size that cannot be made.
     """
-    width, height = extent_m if isinstance(extent_m, tuple) else (extent_m, extent_m)
-    shape = tuple(math.ceil(side / spacing - 1e-6) + 1 for side in (height, width))
+    shape = _shape(preset, extent_m, spacing)
     if preset == "flat":
         return Site("flat", seed, np.zeros(shape, np.float32), spacing, meta={"preset": "flat"})
-    raise InputError("site", f"no preset {preset!r}; presets: flat", "preset")
+    if preset not in generate.PRESETS:
+        raise InputError("site", f"no preset {preset!r}; presets: "
+                         + ", ".join([*generate.PRESETS, "flat"]), "preset")
+    heights, craters, rocks = generate.evaluate(preset, seed, shape, spacing)
+    site = Site(preset, seed, heights, spacing)
+    meta = {
+        "preset": preset,
+        "summary": generate.PRESETS[preset].summary,
+        "craters": {key: craters[key].tolist() for key in ("x", "y", "diameter", "rim")},
+        "boulders_in_ground": int((rocks["diameter"] < generate.OBSTACLE_DIAMETER).sum()),
+    }
+    return replace(site, boulders=tuple(_boulders(site, rocks)), meta=meta)
 
 
 def for_mission(mission: Mission, spacing: float = SPACING) -> Site:
@@ -92,7 +112,186 @@ def for_mission(mission: Mission, spacing: float = SPACING) -> Site:
     return make_site(mission.site.preset or "mare", mission.site.seed, (width, height), spacing)
 
 
-def import_dem(path: str | os.PathLike[str], *, extent_m: float | tuple[float, float],
-               spacing: float = SPACING, seed: int = 0) -> Site:
-    """Ground from an elevation model."""
-    raise InputError(path, "elevation models cannot be read yet")
+def import_dem(
+    path: str | os.PathLike[str],
+    *,
+    extent_m: float | tuple[float, float] | None = None,
+    centre_m: tuple[float, float] = (0.0, 0.0),
+    pixel_m: float | None = None,
+    band: int = 0,
+    scale: float = 1.0,
+    detrend: bool = False,
+    detail: bool = True,
+    spacing: float = SPACING,
+    seed: int = 0,
+) -> Site:
+    """Ground from an elevation model, GeoTIFF or `.npy`. Boulders are not added.
+
+    Args:
+      path: the file. An .npy array is [rows, columns] m, row 0 in the north like a picture.
+      extent_m: side, or (x, y) sides, of the window; None takes all of it.
+      centre_m: the window's centre from the model's centre, m east and north.
+      pixel_m: metres a pixel; needed for .npy and for a GeoTIFF that does not say.
+      band: of a GeoTIFF, counted from 0.
+      scale: multiplies the elevations, for models not in metres.
+      detrend: takes out the plane of best fit, else only the mean.
+      detail: adds relief finer than the model, continuing its power spectrum.
+      spacing: of the site, m.
+      seed: of the added detail.
+
+    Raises InputError: not readable, no data, a scale that cannot be ground, a window outside.
+    """
+    heights, pixel = _read(path, band, pixel_m)
+    window = _window(path, heights * scale, pixel, extent_m, centre_m)
+    window = _fill_holes(path, window)
+    _check_relief(path, window, pixel)
+    window -= _plane(window) if detrend else window.mean()
+    sides = tuple((n - 1) * pixel for n in window.shape[::-1]) if extent_m is None else extent_m
+    shape = _shape(path, sides, spacing)
+    ground = generate.refine(window, pixel, shape, spacing, seed, detail)
+    meta = {"dem": os.fspath(path), "pixel_m": pixel, "centre_m": list(centre_m), "band": band,
+            "scale": scale, "detrend": detrend, "detail": detail and pixel > 2 * spacing}
+    return Site(Path(path).stem, seed, ground, spacing, meta=meta)
+
+
+def _shape(source: object, extent_m: float | tuple[float, ...], spacing: float
+           ) -> tuple[int, int]:
+    """Samples (ny, nx) that cover the extent. Raises InputError if it is none or too many."""
+    width, height = extent_m if isinstance(extent_m, tuple) else (extent_m, extent_m)
+    if not 0.05 <= spacing <= 2.0:
+        raise InputError(source, f"{spacing} m is not allowed; 0.05 to 2", "spacing")
+    if not all(4.0 <= side <= 1000.0 for side in (width, height)):
+        raise InputError(source, f"{width:g} by {height:g} m is not allowed; sides of 4 to 1000 m",
+                         "size")
+    ny, nx = (math.ceil(side / spacing - 1e-6) + 1 for side in (height, width))
+    if ny * nx > MAX_SAMPLES:
+        raise InputError(source, f"{nx} by {ny} samples are too many; at most {MAX_SAMPLES} in "
+                         "all: a smaller size or a wider spacing is needed", "size")
+    return ny, nx
+
+
+def _boulders(site: Site, rocks: dict[str, np.ndarray]) -> list[Boulder]:
+    """Obstacles: the sphere whose cap stands as wide and as high as the rock does."""
+    found = []
+    half = np.array(site.extent)
+    for i in np.flatnonzero(rocks["diameter"] >= generate.OBSTACLE_DIAMETER):
+        xy = np.array([rocks["x"][i], rocks["y"][i]])
+        wide = rocks["diameter"][i] / 2
+        if (np.abs(xy) > half - wide).any():
+            continue
+        high = rocks["height"][i] * (1 - rocks["burial"][i])
+        radius = float((wide**2 + high**2) / (2 * high))
+        ground = float(site.surface.height(jnp.asarray(xy, jnp.float32)))
+        centre = np.array([*xy, ground + high - radius])
+        found.append(Boulder(centre, radius, _rock(radius, np.random.default_rng([site.seed, int(i)]))))
+    return found
+
+
+def _rock(radius: float, random: np.random.Generator) -> np.ndarray:
+    """Corners [n, 3] m of a rough convex rock about a sphere, spread as a Fibonacci spiral.
+
+    Corners stand a little out of the sphere so that the facets between them lie about on it.
+    """
+    count = 48
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    turn = np.pi * (1 + 5**0.5) * index + random.uniform(0, 2 * np.pi)
+    flat = np.sqrt(1 - z**2)
+    points = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    points = points + random.normal(scale=0.08, size=points.shape)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    corners = points * radius * random.uniform(0.97, 1.10, size=(count, 1))
+    hull = trimesh.convex.convex_hull(corners)
+    return np.array(hull.vertices)
+
+
+def _read(path: str | os.PathLike[str], band: int, pixel_m: float | None
+          ) -> tuple[np.ndarray, float]:
+    """Elevations, row 0 in the south, NaN where there is no data, and metres a pixel."""
+    if not Path(path).is_file():
+        raise InputError(path, "no such file")
+    if Path(path).suffix.lower() == ".npy":
+        try:
+            heights, pixel, metric = np.load(path, allow_pickle=False), math.nan, True
+        except (ValueError, OSError, EOFError):
+            raise InputError(path, "is not a NumPy array file") from None
+        if heights.ndim != 2 or heights.dtype.kind not in "fiu":
+            raise InputError(path, f"holds {heights.dtype} of shape {heights.shape}; "
+                             "numbers [rows, columns] are needed")
+        heights = heights[::-1].astype(np.float64)
+    else:
+        try:
+            heights, pixel, metric = generate.read_dem(path, band)
+        except ValueError as error:
+            raise InputError(path, str(error)) from None
+    if not metric:
+        raise InputError(path, "is in degrees of longitude and latitude; project it to metres")
+    if pixel_m is None and not math.isfinite(pixel):
+        raise InputError(path, "does not say how many metres a pixel is; give it", "pixel_m")
+    pixel = pixel if pixel_m is None else pixel_m
+    if not 0.01 <= pixel <= 1000:
+        raise InputError(path, f"{pixel:g} m a pixel is not allowed; 0.01 to 1000", "pixel_m")
+    return heights, pixel
+
+
+def _window(path: str | os.PathLike[str], heights: np.ndarray, pixel: float,
+            extent_m: float | tuple[float, float] | None, centre_m: tuple[float, float]
+            ) -> np.ndarray:
+    """The pixels of the window, whose centre is kept to half a pixel."""
+    rows, columns = heights.shape
+    if min(rows, columns) < 4:
+        raise InputError(path, f"is too small: {columns} by {rows} pixels; at least 4 by 4")
+    if extent_m is None:
+        return heights.copy()
+    sides = extent_m if isinstance(extent_m, tuple) else (extent_m, extent_m)
+    slices = []
+    for name, count, side, at in zip(("wide", "high"), (columns, rows), sides, centre_m,
+                                     strict=True):
+        middle = (count - 1) / 2 + at / pixel
+        reach = side / 2 / pixel
+        first, last = math.floor(middle - reach), math.ceil(middle + reach)
+        if first < 0 or last > count - 1:
+            raise InputError(path, f"is too small: it is {(count - 1) * pixel:g} m {name}, the "
+                             f"window needs {side:g} m around {at:g} m from the centre")
+        slices.append(slice(first, last + 1))
+    window = heights[slices[1], slices[0]].copy()
+    if min(window.shape) < 4:
+        raise InputError(path, f"is too coarse: the window spans {window.shape[1]} by "
+                         f"{window.shape[0]} pixels of {pixel:g} m; at least 4 by 4")
+    return window
+
+
+def _fill_holes(path: str | os.PathLike[str], window: np.ndarray) -> np.ndarray:
+    """Small holes take the mean of their surroundings, from the edge inwards."""
+    missing = ~np.isfinite(window)
+    share = missing.mean()
+    if share > MAX_MISSING:
+        raise InputError(path, f"has no data in {100 * share:.0f} % of the window; at most "
+                         f"{100 * MAX_MISSING:.0f} %")
+    while missing.any():
+        padded = np.pad(window, 1, constant_values=np.nan)
+        around = np.stack([padded[1 + dy:1 + dy + len(window), 1 + dx:1 + dx + window.shape[1]]
+                           for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+        known = np.isfinite(around)
+        mean = np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        reached = missing & known.any(axis=0)
+        window[reached] = mean[reached]
+        missing &= ~reached
+    return window
+
+
+def _check_relief(path: str | os.PathLike[str], window: np.ndarray, pixel: float) -> None:
+    """Raises InputError where elevations cannot be metres of ground."""
+    relief, width = float(np.ptp(window)), pixel * (min(window.shape) - 1)
+    if not np.isfinite(relief) or relief > width:
+        raise InputError(path, f"rises {relief:g} m within {width:g} m: elevations or pixels "
+                         "are not in metres (see scale and pixel_m)")
+
+
+def _plane(window: np.ndarray) -> np.ndarray:
+    """The plane of best fit, sampled like the window."""
+    y, x = (np.arange(n) - (n - 1) / 2 for n in window.shape)
+    # The axes are centred, so the three coefficients are independent.
+    gx = (window * x[None, :]).sum() / (x**2).sum() / len(y)
+    gy = (window * y[:, None]).sum() / (y**2).sum() / len(x)
+    return window.mean() + gx * x[None, :] + gy * y[:, None]
