@@ -34,6 +34,8 @@ class Args:
     """Run folder; runs/PRESET-SEED if not given."""
     resume: bool = False
     """Go on with the run in the folder."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints; a chunk of updates is never cut."""
     dry_run: bool = False
     """Print the numbers, totals, memory and work, train nothing."""
     json: bool = False
@@ -74,7 +76,7 @@ def _train(args: Args) -> int:
 
     config = args.config
     out = args.out or Path("runs") / f"{config.name}-{config.seed}"
-    run = loop.Run(config, out, args.resume)
+    run = loop.Run(config, out, args.resume, args.checkpoint_seconds)
     say = sys.stderr if args.json else sys.stdout
     try:
         with loop.stop_on_signals() as stop:

@@ -31,7 +31,6 @@ from training.grid_task import GridTask
 from training.networks import Networks, Pair
 from training.update import Learner, Report
 
-CHECKPOINT_SECONDS = 30.0
 FINAL_SCENARIOS = 500
 
 
@@ -83,9 +82,9 @@ class Run:
     `report.json` and `curve.png`.
     """
 
-    def __init__(self, config: Config, out: Path, resume: bool):
+    def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0):
         """Raises InputError if the folder holds a run that this one may not go on with."""
-        self.config, self.out = config, out
+        self.config, self.out, self.checkpoint_seconds = config, out, checkpoint_seconds
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
         self.folder = out / "checkpoints"
         self.position, arrays = self._find(resume)
@@ -171,7 +170,7 @@ class Run:
                 return False
             count = min(self.config.chunk_updates, phase.updates - self.position.update)
             progress.show(self._chunk(phase, count))
-            if time.monotonic() - self.last_saved > CHECKPOINT_SECONDS:
+            if time.monotonic() - self.last_saved > self.checkpoint_seconds:
                 self.save()
         return True
 

@@ -6,7 +6,7 @@ Legend: T steps, E environments, N agents, D observation length, H width, A acti
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,8 @@ from moonteam.policies.recurrent import Recurrent, RecurrentSpec
 class Pair(NamedTuple):
     """Something that actor and critic each have: parameters, optimiser state, memory."""
 
-    actor: dict | Array
-    critic: dict | Array
+    actor: Any
+    critic: Any
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,8 @@ def _apply(net: Recurrent, params: dict, hidden: Array, inputs: Array,
     steps, envs, agents = inputs.shape[:3]
     flat = inputs.reshape(steps, envs * agents, inputs.shape[3])
     flags = jnp.repeat(reset, agents, axis=1)
-    after, out = net.apply({"params": params}, hidden.reshape(envs * agents, -1), flat, flags)
+    result: Any = net.apply({"params": params}, hidden.reshape(envs * agents, -1), flat, flags)
+    after, out = result
     return after.reshape(hidden.shape), out.reshape(steps, envs, agents, -1)
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.typing import ArrayLike
 
 from training import gae, losses, rollout
 from training.hyper import Hyper
@@ -44,8 +45,8 @@ def optimiser(hyper: Hyper) -> optax.GradientTransformation:
     """Adam behind a gradient-norm clip; the rate falls linearly, once an update."""
     per_update = hyper.num_minibatches * hyper.update_epochs
 
-    def rate(count: Array) -> Array:
-        return hyper.lr * (1.0 - (count // per_update) / hyper.updates)
+    def rate(count: ArrayLike) -> Array:
+        return hyper.lr * (1.0 - (jnp.asarray(count) // per_update) / hyper.updates)
 
     return optax.chain(optax.clip_by_global_norm(hyper.max_grad_norm),
                        optax.adam(rate, eps=hyper.adam_eps))

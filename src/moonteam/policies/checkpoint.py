@@ -70,7 +70,8 @@ def check_shapes(path: object, found: dict, wanted: dict) -> None:
 
     `wanted` is a tree of arrays or `jax.ShapeDtypeStruct`s.
     """
-    have, want = flatten_dict(found, sep="/"), flatten_dict(wanted, sep="/")
+    have: dict[str, Any] = dict(flatten_dict(found, sep="/"))
+    want: dict[str, Any] = dict(flatten_dict(wanted, sep="/"))
     for name in sorted({*map(str, have), *map(str, want)}):
         if name not in have or name not in want:
             what = "is missing" if name not in have else "does not belong to this network"
