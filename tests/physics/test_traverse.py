@@ -88,7 +88,8 @@ def test_routes_keep_off_walls_and_boulders():
         assert clear > rock.radius + kind.footprint
 
 
-def test_impossible_routes_are_refused():
+def test_impossible_routes_are_refused(monkeypatch):
+    monkeypatch.setattr(traverse, "DRAWS", 40)
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match="too small"):
         traverse.draw_routes(KINDS["drone"], site(), 1, 60.0, rng)

@@ -56,6 +56,7 @@ class World:
 
     def __post_init__(self):
         self.data = mujoco.MjData(self.scene.model)
+        self.data.qpos[:] = self.scene.qpos0
         mujoco.mj_forward(self.scene.model, self.data)
         self.state = self.kind.init(*self._slices())
 

@@ -30,6 +30,7 @@ WHEEL_RADIUS = 0.14  # m
 HALF_TRACK, HALF_BASE = 0.28, 0.21  # m, wheel centres from the chassis' centre
 STANDING_HEIGHT = 0.22  # m
 MASS = 15.0  # kg
+FOOTPRINT = 0.4  # m
 MAX_TORQUE = 1.2  # N m, each wheel
 CRUISE_SPEED = 0.5  # m/s, analogue of a flight rover's 0.2 m/s
 
@@ -47,7 +48,9 @@ POSITION_GAIN = 1.0  # 1/s
 STOP, RESTART = 0.04, 0.10  # m from the waypoint: stops within, moves again beyond
 REVERSE_WITHIN = 1.6  # m; a shorter way back is driven backwards
 SLIP = 0.15  # m/s between rim and ground, plus half the ground speed
-CLIMB_LIMIT = np.deg2rad(17.5)  # of the ground ahead; at a slope of 20 deg it stands still
+MAX_SLOPE = float(np.deg2rad(18.0))  # of the ground it is sent over
+REFUSED = np.deg2rad(19.7)  # of the ground ahead: there it stands still
+CAUTION = np.deg2rad(1.0)  # before that it slows down
 TILT_LIMIT = np.deg2rad(30.0)  # of the chassis
 
 SPEED_GAIN = MASS * GRAVITY * WHEEL_RADIUS * 0.2  # N m per rad/s, one wheel
@@ -158,23 +161,22 @@ def _steer(
 
 
 def _passable(speed: Array, qpos: Array, rotation: Array, surface: Surface) -> Array:
-    """1 on ground it may enter, falling to 0 at CLIMB_LIMIT ahead or TILT_LIMIT now.
+    """1 on ground it may enter, falling to 0 at REFUSED ahead or TILT_LIMIT now.
 
-    Slope is that of the plane through ground points 1.2 m apart, so that roughness does not
-    count as slope. A rover that tilts too far may still drive to its lower side.
+    Slope is that of the plane under its footprint, which is also what traversability is judged
+    by. Where it already stands too steep it may still move to flatter ground, and where it
+    tilts too far, to its lower side.
     """
     forward = rotation[:2, 0] / (jnp.linalg.norm(rotation[:2, 0]) + 1e-6)
-    left = jnp.array([-1.0, 1.0]) * forward[::-1]
     way = jnp.where(speed < 0.0, -1.0, 1.0) * forward
-    reach = 0.6
-    points = jnp.stack([forward, -forward, left, -left]) * reach
-    z = surface.height(points + (qpos[:2] + 0.5 * way)[None, :])
-    slope = jnp.sqrt((z[0] - z[1]) ** 2 + (z[2] - z[3]) ** 2) / (2.0 * reach)
-    ahead = (jnp.tan(CLIMB_LIMIT) - slope) / 0.03
+    points = qpos[None, :2] + jnp.array([[0.0], [FOOTPRINT]]) * way[None, :]
+    _, normals = surface.plane(points, FOOTPRINT)
+    here, ahead = jnp.arccos(jnp.clip(normals[:, 2], -1.0, 1.0))
+    slope = (jnp.maximum(REFUSED, here - CAUTION) - ahead) / CAUTION
     tilt = (rotation[2, 2] - jnp.cos(TILT_LIMIT)) / 0.03
     downwards = jnp.sum(way * rotation[:2, 2]) > 0.2
     tilt = jnp.where(downwards, 1.0, tilt)
-    return jnp.clip(jnp.minimum(ahead, tilt), 0.0, 1.0)
+    return jnp.clip(jnp.minimum(slope, tilt), 0.0, 1.0)
 
 
 def _wheel_speeds(speed: Array, turn: Array, rotation: Array, qvel: Array) -> Array:
@@ -188,5 +190,5 @@ def _wheel_speeds(speed: Array, turn: Array, rotation: Array, qvel: Array) -> Ar
 
 WHEELED = RobotKind(
     name="wheeled", load=load, base="chassis", spawn_height=STANDING_HEIGHT, home=np.zeros(6),
-    speed=CRUISE_SPEED, footprint=0.4, max_slope=float(np.deg2rad(18.0)), init=init,
+    speed=CRUISE_SPEED, footprint=FOOTPRINT, max_slope=MAX_SLOPE, init=init,
     control=control)
