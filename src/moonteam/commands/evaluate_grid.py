@@ -43,7 +43,8 @@ class Args:
     preference: Many[tuple[float, ...]] = ()
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()
-    """argmax, sample or best-of-K such as best-of-16; again for more rows. Default: argmax."""
+    """argmax, plain-argmax (without the deadlock watch), sample, best-of-K such as best-of-16;
+    again for more rows. Default: argmax."""
     temperature: float = 1.0
     """Of sampling: below 1 is bolder, above 1 more random."""
     alpha: float = 1.0

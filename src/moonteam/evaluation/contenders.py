@@ -11,15 +11,20 @@ from typing import Protocol
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.evaluation import actors, rollouts
 from moonteam.evaluation import decode as decoding
-from moonteam.evaluation.actors import Loaded
+from moonteam.evaluation import rollouts
 from moonteam.evaluation.decode import Decode
 from moonteam.evaluation.metrics import Outcomes
 from moonteam.evaluation.progress import track
 from moonteam.evaluation.world import Walk, World, joint_actions, replay, snapshots
-from moonteam.planners import simulate
+from moonteam.planners import exact, exhaustive, simulate
 from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
+from moonteam.planners.cpsat import CpSatPlanner
+from moonteam.planners.exact import ExactPlanner
+from moonteam.planners.exhaustive import ExhaustivePlanner
+from moonteam.planners.greedy import GreedyPlanner
+from moonteam.planners.large import LnsPlanner
+from moonteam.planners.learned import EntityBrain, Policy
 
 OBJECTIVES: dict[str, Objective] = {"makespan": "makespan", "moves": "moves",
                                     "weighted": "weighted"}
@@ -76,14 +81,30 @@ class Contender(Protocol):
 
 
 def _exact(options: Options, objective: Objective) -> WholePlanner:
-    from moonteam.planners.exact import ExactPlanner
-
     return ExactPlanner(objective, options.alpha, options.beta, options.time_limit)
 
 
+def _greedy(options: Options, objective: Objective) -> WholePlanner:
+    return GreedyPlanner(objective, options.alpha, options.beta)
+
+
+def _lns(options: Options, objective: Objective) -> WholePlanner:
+    return LnsPlanner(objective, options.alpha, options.beta, time_limit=options.time_limit,
+                      seed=options.seed)
+
+
+def _cpsat(options: Options, objective: Objective) -> WholePlanner:
+    return CpSatPlanner(objective, options.alpha, options.beta, options.time_limit)
+
+
+def _exhaustive(options: Options, objective: Objective) -> WholePlanner:
+    return ExhaustivePlanner(objective, options.alpha, options.beta)
+
+
 PLANNERS: dict[str, Callable[[Options, Objective], WholePlanner]] = {
-    "exact": _exact,
-}
+    "exact": _exact, "greedy": _greedy, "lns": _lns, "cpsat": _cpsat, "exhaustive": _exhaustive}
+LIMITS = {"exact": exact.MAX_TARGETS, "exhaustive": exhaustive.MAX_TARGETS}
+"""Targets of a scenario that some planners refuse to go beyond."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +121,10 @@ class Planned:
         return f"{self.kind}({self.objective})"
 
     def check(self, world: World) -> None:
-        """The planners say so themselves when they are asked to plan."""
+        """Raises InputError, the planner's own, if a scenario has too many targets for it."""
+        most = max(world.scenarios, key=lambda s: len(s.targets))
+        if len(most.targets) - world.num_buffer > LIMITS.get(self.kind, len(most.targets)):
+            self.planner.plan(Snapshot.start(most))
 
     def run(self, world: World) -> Outcomes:
         """See `Contender`; plans round by round, a round ends where a target appears."""
@@ -148,11 +172,11 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Policy:
-    """A learned policy; best-of-K keeps, of K sampled rollouts, the best by the objective."""
+class Learned:
+    """A policy; best-of-K keeps, of K sampled rollouts, the best by the objective."""
 
     name: str
-    loaded: Loaded
+    policy: Policy
     decode: Decode
     objective: Objective
     preference: float
@@ -160,17 +184,22 @@ class Policy:
 
     def check(self, world: World) -> None:
         """See `Contender`."""
-        self.loaded.actor.check(world, self.loaded.path)
+        for moment in snapshots(world, world.start):
+            self.policy.check(moment)
 
     def run(self, world: World) -> Outcomes:
         """See `Contender`."""
         options = self.options
-        tries = rollouts.run(self.loaded, world, self.decode, self.preference,
+        tries = rollouts.run(self.policy, world, self.decode, self.preference,
                              options.temperature, options.seed, self.name)
         choice = rollouts.best(tries, self.objective, options.alpha, options.beta)
-        success, steps, moves = (rollouts.picked(v, choice) for v in (
-            tries.success, tries.steps, tries.moves))
-        return Outcomes(self.name, success, steps, moves, tries.seconds, tries.compiling)
+        success, steps, moves, rescues = (rollouts.picked(v, choice) for v in (
+            tries.success, tries.steps, tries.moves, tries.rescues))
+        note = ""
+        if self.decode.watch:
+            note = (f"the deadlock watch drew {rescues.sum()} of {steps.sum()} decisions, in "
+                    f"{(rescues > 0).sum()} of {len(world)} scenarios; plain-argmax goes without")
+        return Outcomes(self.name, success, steps, moves, tries.seconds, tries.compiling, note)
 
 
 def outcomes(name: str, world: World, walk: Walk, seconds: float, first_call: float) -> Outcomes:
@@ -216,11 +245,11 @@ def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contend
         if not 0.0 <= preference <= 1.0:
             raise InputError("--preference", f"{preference} is not allowed; 0 (time) to 1 (effort)")
     decodes = [decoding.parse(text) for text in dict.fromkeys(options.decodes)]
-    loaded = [actors.load(path) for path in options.policies]
+    policies = [Policy.load(path) for path in options.policies]
     found: list[Contender] = []
-    for policy in loaded:
-        stem = "policy" if len(loaded) == 1 else policy.name
-        given = options.preferences if policy.actor.takes_preference else ()
+    for path, policy in zip(options.policies, policies, strict=True):
+        stem = "policy" if len(policies) == 1 else path.stem
+        given = options.preferences if isinstance(policy.brain, EntityBrain) else ()
         for preference in given or (0.0,):
             for decode in decodes:
                 for objective in objectives if decode.rollouts > 1 else objectives[:1]:
@@ -231,8 +260,8 @@ def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contend
                         words.append(objective)
                     if given:
                         words.append(f"preference {preference:g}")
-                    found.append(Policy(f"{stem}({', '.join(words)})", policy, decode, objective,
-                                        preference, options))
+                    found.append(Learned(f"{stem}({', '.join(words)})", policy, decode,
+                                         objective, preference, options))
     names = [one.name for one in found]
     if len(set(names)) < len(names):
         raise InputError("--policy", "two policy files have the same name; rename one")

@@ -82,22 +82,36 @@ def markdown(document: dict, columns: Sequence[Column]) -> str:
 
 
 def show(document: dict, columns: Sequence[Column]) -> None:
-    """The table on the terminal, one planner a column, so that intervals have room."""
+    """The table on the terminal: a planner a column, intervals under the values.
+
+    Where the planners do not fit beside each other, there are several tables.
+    """
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=document["title"], title_justify="left")
-    table.add_column("")
-    for row in document["summary"]:
-        table.add_column(row["planner"], justify="right", overflow="fold")
-    for column in columns:
-        table.add_row(column.title, *(cell(row, column, spread=True)
-                                      for row in document["summary"]))
     console = Console()
-    console.print(table)
-    for note in document["notes"]:
+    rows = document["summary"]
+    room = max(1, (console.width - _TITLE_WIDTH) // _VALUE_WIDTH)
+    for first in range(0, len(rows), room):
+        part = rows[first:first + room]
+        table = Table(title=document["title"] if first == 0 else None, title_justify="left")
+        table.add_column("")
+        for row in part:
+            table.add_column(row["planner"], justify="right", min_width=_VALUE_WIDTH - 3)
+        for column in columns:
+            table.add_row(column.title, *(_two_lines(row, column) for row in part))
+        console.print(table)
+    for note in (*document["notes"], hardware_line(document["meta"])):
         console.print(note, highlight=False, markup=False)
-    console.print(hardware_line(document["meta"]), highlight=False, markup=False)
+
+
+_TITLE_WIDTH, _VALUE_WIDTH = 22, 21
+
+
+def _two_lines(row: dict, column: Column) -> str:
+    """A value and, beneath it, its interval."""
+    value, _, spread = cell(row, column, spread=True).partition(" [")
+    return f"{value}\n[dim]\\[{spread}[/dim]" if spread else value
 
 
 def table_csv(document: dict) -> str:

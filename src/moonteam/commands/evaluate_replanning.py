@@ -1,0 +1,110 @@
+"""`moonteam evaluate replanning`: new targets appear while the team is under way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from moonteam import compilation, files, paths
+from moonteam.commands.evaluate_grid import Many, command_line, load_set
+from moonteam.errors import InputError
+from moonteam.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Args:
+    """The paper's 5 + 5 experiment: each of the first five targets solved makes way for another.
+
+    SET holds scenarios of ten targets, the last five of which appear later; without SET,
+    --count scenarios are drawn from --seed (3 agents, 32 x 32). All planners meet the same new
+    targets in the same order. The exact planner, which plans anew whenever a target appears,
+    is always there to compare with. Options marked "again" may be given several times.
+
+    Examples:
+      moonteam evaluate replanning --count 200
+      moonteam evaluate replanning --count 1000 --planner greedy --planner policy --policy pi_5t
+      moonteam evaluate replanning ten_targets.jsonl --planner exact --json
+    """
+
+    set: tyro.conf.Positional[str | None] = None
+    """Scenario set (.jsonl) or the name of a bundled one."""
+    planner: Many[tuple[str, ...]] = ()
+    """exact, greedy, lns or policy; again for more rows. Default: exact."""
+    objective: Many[tuple[str, ...]] = ()
+    """makespan, moves or weighted; again for more rows. Default: makespan."""
+    policy: Many[tuple[str, ...]] = ()
+    """Policy file (.safetensors) or the name of a bundled policy; again for more."""
+    preference: Many[tuple[float, ...]] = ()
+    """0 (time) to 1 (effort), for policies that take one; again for more rows."""
+    decode: Many[tuple[str, ...]] = ()
+    """argmax, plain-argmax (without the deadlock watch) or sample; again for more rows.
+    Default: argmax."""
+    temperature: float = 1.0
+    """Of sampling: below 1 is bolder, above 1 more random."""
+    new: int = 5
+    """How many of a scenario's targets appear later."""
+    count: int = 200
+    """Scenarios to draw where no SET is given, each with 5 targets and --new more."""
+    seed: int = 0
+    """Seed of the scenarios drawn, of sampling and of the bootstrap."""
+    time_limit: float | None = None
+    """Seconds a plan that anytime planners may take; theirs by default."""
+    limit: int | None = None
+    """Only the first so many scenarios of the set."""
+    json: bool = False
+    """Print the report as one JSON document and nothing else."""
+    markdown: bool = False
+    """Print the table as Markdown and nothing else."""
+    out: Path | None = None
+    """Folder for report.json, summary.csv, rows.csv, table.md and replanning.png."""
+
+
+def _scenarios(args: Args) -> tuple[list[Scenario], str]:
+    """The scenarios and a title."""
+    from moonteam.evaluation import replanning
+
+    if args.new < 1:
+        raise InputError("--new", f"{args.new} is not allowed; at least 1")
+    if args.set is not None:
+        found = load_set(args.set, args.limit)
+        return found, f"{Path(args.set).stem}, replanning: {len(found)} scenarios"
+    found = replanning.draw(args.count, args.seed, 5 + args.new)[:args.limit]
+    return found, f"replanning 5 + {args.new}: {len(found)} scenarios"
+
+
+def run(args: Args) -> int:
+    """Evaluates, prints, saves; 0 whatever the planners achieved."""
+    compilation.enable_cache()
+    from moonteam.evaluation import figures, replanning, report
+    from moonteam.evaluation.contenders import Options, contenders
+
+    if any(text.startswith("best-of") for text in args.decode):
+        raise InputError("--decode", "best-of-K looks ahead, which nobody can where targets "
+                         "appear unannounced; argmax or sample")
+    found, title = _scenarios(args)
+    options = Options(
+        planners=args.planner or ("exact",), objectives=args.objective or ("makespan",),
+        policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
+        preferences=args.preference, decodes=args.decode or ("argmax",),
+        temperature=args.temperature, time_limit=args.time_limit, seed=args.seed)
+    rows = contenders(options)
+    command = command_line("evaluate replanning", [args.set] if args.set else [], {
+        "planner": options.planners, "objective": args.objective, "policy": args.policy,
+        "preference": args.preference, "decode": args.decode,
+        "temperature": args.temperature if args.temperature != 1.0 else None,
+        "new": args.new if args.new != 5 else None,
+        "count": None if args.set else args.count, "seed": args.seed or None,
+        "time-limit": args.time_limit, "limit": args.limit})
+    document = replanning.evaluate(found, rows, args.new, args.seed, title, command)
+    if args.out:
+        report.save(args.out, document, replanning.COLUMNS)
+        figures.bars(args.out / "replanning.png", document, replanning.PANELS)
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(report.markdown(document, replanning.COLUMNS))
+    else:
+        report.show(document, replanning.COLUMNS)
+    return 0
