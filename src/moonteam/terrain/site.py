@@ -183,7 +183,8 @@ def _boulders(site: Site, rocks: dict[str, np.ndarray]) -> list[Boulder]:
         radius = float((wide**2 + high**2) / (2 * high))
         ground = float(site.surface.height(jnp.asarray(xy, jnp.float32)))
         centre = np.array([*xy, ground + high - radius])
-        found.append(Boulder(centre, radius, _rock(radius, np.random.default_rng([site.seed, int(i)]))))
+        random = np.random.default_rng([site.seed, int(i)])
+        found.append(Boulder(centre, radius, _rock(radius, random)))
     return found
 
 
