@@ -1,0 +1,218 @@
+"""`moonteam plan`: one scenario, one planner, the schedule as table, picture and JSON."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from moonteam import files, mission, paths, scenario
+from moonteam.errors import InputError
+from moonteam.planners.base import Objective, Plan, Snapshot
+from moonteam.scenario import Scenario
+
+PlannerName = Literal["exact", "greedy", "lns", "cpsat", "exhaustive", "policy"]
+
+
+@dataclass(frozen=True)
+class Args:
+    """Plan a scenario: who goes where, with whom and when; with a certificate if exact.
+
+    SCENARIO is a scenario file (.json), one line of a set (set.jsonl:INDEX, counted from 0,
+    or set.jsonl:ID), a mission (.yaml), or the name of a bundled set or mission.
+
+    Examples:
+      moonteam plan scenario.json --objective moves
+      moonteam plan 3x7:12 --planner exact --out runs/plan
+      moonteam plan assets/testsets/8x40.jsonl:3 --planner lns --time-limit 10
+      moonteam plan outpost --objective weighted --alpha 1 --beta 0.05 --json
+      moonteam plan demo --planner policy --policy small
+    """
+
+    scenario: tyro.conf.Positional[str]
+    """Scenario, set.jsonl:INDEX or set.jsonl:ID, or mission."""
+    planner: PlannerName = "exact"
+    """exact (proves its plan the best; up to 12 targets), greedy, lns (large-neighbourhood
+    search), cpsat (needs the extra ortools), exhaustive (up to 6 targets) or policy."""
+    objective: Objective = "makespan"
+    """Least makespan (and then few moves), fewest moves, or alpha * makespan + beta * moves."""
+    alpha: float = 1.0
+    """Weight of the makespan in the objective weighted."""
+    beta: float = 0.05
+    """Weight of the moves in the objective weighted."""
+    time_limit: float | None = None
+    """Seconds after which exact, lns and cpsat return the best plan they have."""
+    policy: str | None = None
+    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
+    seed: int = 0
+    """Seed of lns and of a policy that samples."""
+    json: bool = False
+    """Print the plan as one JSON document and nothing else."""
+    out: Path | None = None
+    """Folder for plan.json and plan.png."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scenario with the names to print."""
+
+    scenario: Scenario
+    title: str
+    agents: tuple[str, ...]
+    targets: tuple[str, ...]
+
+
+def load_case(name: str) -> Case:
+    """The scenario that the command line names. Raises InputError."""
+    if Path(name).suffix in (".yaml", ".yml"):
+        return _mission_case(Path(name))
+    head, colon, which = name.rpartition(":")
+    if colon and not Path(name).exists():
+        return _named(_pick(paths.find(head, "testsets", ".jsonl"), which))
+    path = Path(name)
+    if not path.suffix and not path.exists():
+        bundled = paths.assets()
+        if (bundled / "testsets" / f"{name}.jsonl").is_file():
+            raise InputError(name, f"is a set; choose one of its scenarios, such as {name}:0")
+        return _mission_case(paths.find(name, "missions", ".yaml"))
+    if path.suffix == ".jsonl":
+        found = scenario.load_set(path)
+        if len(found) > 1:
+            raise InputError(path, f"holds {len(found)} scenarios; choose one, such as {path}:0")
+        return _named(found[0])
+    return _named(scenario.load(path))
+
+
+def _pick(path: Path, which: str) -> Scenario:
+    """Scenario number `which` of a set, or the one with that id."""
+    found = scenario.load_set(path)
+    same = [s for s in found if s.id == which]
+    if same:
+        return same[0]
+    if which.isdecimal() and int(which) < len(found):
+        return found[int(which)]
+    raise InputError(path, f"has no scenario {which!r}; a number 0 to {len(found) - 1} or an id, "
+                     f"such as {found[0].id or 'none here'}")
+
+
+def _named(found: Scenario) -> Case:
+    return Case(found, found.id or "scenario",
+                tuple(f"R{i + 1}" for i in range(len(found.agents))),
+                tuple(f"T{j + 1}" for j in range(len(found.targets))))
+
+
+def _mission_case(path: Path) -> Case:
+    found = mission.load(path)
+    return Case(found.scenario(), found.name or path.stem, tuple(r.name for r in found.robots),
+                tuple(found.target_name(j) for j in range(len(found.targets))))
+
+
+def make_plan(args: Args, snapshot: Snapshot) -> Plan:
+    """The plan that the chosen planner makes. Raises InputError."""
+    common = (args.objective, args.alpha, args.beta)
+    if args.planner == "exact":
+        from moonteam.planners.exact import ExactPlanner
+
+        return ExactPlanner(*common, time_limit=args.time_limit).plan(snapshot)
+    if args.planner == "greedy":
+        from moonteam.planners.greedy import GreedyPlanner
+
+        return GreedyPlanner(*common).plan(snapshot)
+    if args.planner == "lns":
+        from moonteam.planners.large import LnsPlanner
+
+        return LnsPlanner(*common, time_limit=args.time_limit, seed=args.seed).plan(snapshot)
+    if args.planner == "cpsat":
+        from moonteam.planners.cpsat import CpSatPlanner
+
+        return CpSatPlanner(*common, time_limit=args.time_limit).plan(snapshot)
+    if args.planner == "exhaustive":
+        from moonteam.planners.exhaustive import ExhaustivePlanner
+
+        return ExhaustivePlanner(*common).plan(snapshot)
+    return _policy_plan(args, snapshot)
+
+
+def _policy_plan(args: Args, snapshot: Snapshot) -> Plan:
+    if args.policy is None:
+        raise InputError("--planner policy", "needs --policy FILE")
+    from moonteam import compilation
+    from moonteam.planners.learned import LearnedPlanner
+    from moonteam.planners.rollout import plan_from_planner
+
+    compilation.enable_cache()
+    path = paths.find(args.policy, "policies", ".safetensors")
+    return plan_from_planner(LearnedPlanner.load(path), snapshot, args.objective, args.seed)
+
+
+def check(args: Args) -> None:
+    """Raises InputError for options that make no sense."""
+    limit = args.time_limit
+    if limit is not None and not (math.isfinite(limit) and limit > 0):
+        raise InputError("--time-limit", f"{limit} is not allowed; seconds above 0")
+    if args.seed < 0:
+        raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
+
+
+def print_plan(case: Case, plan: Plan, alpha: float, beta: float) -> None:
+    """The schedule as a table, and one line about the plan."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if plan.status == "infeasible":
+        console.print(f"{case.title}: no plan: {plan.reason}", soft_wrap=True, highlight=False)
+        return
+    table = Table(title=f"{case.title}: {plan.planner}, {plan.objective}")
+    table.add_column("step", justify="right")
+    table.add_column("target")
+    table.add_column("cell", justify="right")
+    table.add_column("needs")
+    table.add_column("solved by")
+    for visit in plan.schedule:
+        target = case.scenario.targets[visit.target]
+        word = f" {target.type} " if len(set(target.skills)) > 1 else ""
+        team = (f"{case.agents[a]} ({''.join(case.scenario.agents[a].skills)})"
+                for a in visit.agents)
+        table.add_row(str(visit.step), case.targets[visit.target],
+                      f"{target.at[0]}, {target.at[1]}", word.join(target.skills),
+                      " with ".join(team))
+    console.print(table)
+    walks = (plan.actions != scenario.ACTIONS.index("stay")).sum(0).tolist()
+    each = ", ".join(f"{name} {count}" for name, count in zip(case.agents, walks, strict=True))
+    console.print(f"makespan {plan.makespan} steps, {plan.moves} moves ({each})",
+                  soft_wrap=True, highlight=False)
+    console.print(_verdict(plan, alpha, beta), soft_wrap=True, highlight=False)
+
+
+def _verdict(plan: Plan, alpha: float, beta: float) -> str:
+    """What the plan's status means, in words."""
+    goal = str(plan.objective)
+    if plan.objective == "weighted":
+        goal = f"{alpha:g}·makespan + {beta:g}·moves"
+    if plan.status == "optimal":
+        return f"optimal: proved that no plan has less {goal}"
+    if plan.bound is None:
+        return f"feasible: nothing is proved about its {goal}"
+    return f"feasible: proved that no plan has less than {plan.bound:g} of {goal}"
+
+
+def run(args: Args) -> int:
+    """Plans, prints, and draws; 1 if there is no plan."""
+    check(args)
+    case = load_case(args.scenario)
+    plan = make_plan(args, Snapshot.start(case.scenario))
+    if args.json:
+        print(files.dump_json(plan.document()))
+    else:
+        print_plan(case, plan, args.alpha, args.beta)
+    if args.out is not None:
+        from moonteam.planners.figure import draw_plan
+
+        files.write_json(args.out / "plan.json", plan.document(), indent=0)
+        draw_plan(args.out / "plan.png", case.scenario, plan, case.title, case.agents,
+                  case.targets)
+    return 1 if plan.status == "infeasible" else 0
