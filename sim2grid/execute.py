@@ -193,15 +193,14 @@ class Execution:
     def _look_for_arrivals(self, poses: npt.NDArray, seconds: float) -> None:
         """Ends the legs of robots that are there, or late; poses [T + 1, R, 7]."""
         moved = poses[-1, :, :2] - poses[0, :, :2]
-        speed: npt.NDArray = np.linalg.norm(moved, axis=-1) / seconds
-        seen = np.isfinite(poses[-1, :, :2]).all(-1)
-        self._xy = np.where(seen[:, None], poses[-1, :, :2], self._xy)
+        seen = np.isfinite(poses[-1, :, :2].sum(-1, keepdims=True))
+        self._xy = np.where(seen, poses[-1, :, :2], self._xy)
         for i, leg in enumerate(self.legs):
             if leg is None or leg.ended is not None:
                 continue
             near = np.hypot(*(self._xy[i] - leg.waypoint)) <= self._tolerance
             inside = self.frame.inside(self._xy[i], np.array(leg.goal_cell))
-            slow = speed[i] <= self.rules.arrive_speed * self.bodies[i].speed
+            slow = np.hypot(*moved[i]) <= self.rules.arrive_speed * self.bodies[i].speed * seconds
             if not leg.moving or (near and inside and slow and self._tilted_s[i] == 0.0):
                 self._close_leg(i, "arrived")
                 self._stalls[i] = 0

@@ -1,7 +1,7 @@
 """The grid to physics: a point in its goal cell for each robot.
 
 A waypoint is the centre of the robot's cell. Where several robots that stand on the ground
-are bound for one cell, each gets its own quarter of it, so that
+are bound for one cell, each gets its own quarter, so that
 a target that needs two of them does not ask for two bodies in one place. Flyers keep to the
 centre: they pass above.
 """
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from moonteam.scenario import Cell
 from sim2grid.frames import Frame
 
-SLOTS = 0.25 * np.array([[-1, -1], [1, 1], [-1, 1], [1, -1]])
+SLOTS = 0.22 * np.array([[-1, -1], [1, 1], [-1, 1], [1, -1]])
 """Places [4, 2] of robots that share a cell, in cells from its centre."""
 
 

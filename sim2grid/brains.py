@@ -1,0 +1,75 @@
+"""The planners that can drive an execution, by the names of the command line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from moonteam.errors import InputError
+from moonteam.planners import simulate
+from moonteam.planners.base import IntArray, Objective, Planner, Snapshot
+from moonteam.planners.follow import same_moment
+from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
+
+PLANNERS = ("policy", "exact", "greedy")
+
+
+class BestOfPlanner:
+    """Follows the best of K sampled rollouts of a policy; samples again when off that plan.
+
+    Where none of them solves the mission it decides step by step instead.
+    """
+
+    name = "policy"
+
+    def __init__(self, policy: Policy, rollouts: int, objective: Objective):
+        self.policy, self.rollouts = policy, rollouts
+        self.objective: Objective = objective
+        self._stepwise = LearnedPlanner(policy)
+        self._begin(0)
+
+    def _begin(self, seed: int) -> None:
+        self._seed = seed
+        self._actions: list[IntArray] = []
+        self._expected: Snapshot | None = None
+
+    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
+        """Starts a mission. Raises InputError if the policy cannot serve it."""
+        self._stepwise.reset(snapshot, seed)
+        self._begin(seed)
+
+    def act(self, snapshot: Snapshot) -> IntArray:
+        """Joint action [N]."""
+        if self._expected is None or not same_moment(snapshot, self._expected):
+            # From step 0, so that the compiled rollout has one length.
+            plan = plan_best_of(self.policy, replace(snapshot, step=0), self.rollouts,
+                                self._seed, self.objective)
+            self._actions = list(plan.actions)
+        joint = self._actions.pop(0) if self._actions else self._stepwise.act(snapshot)
+        held = replace(snapshot, solved=simulate.holding(snapshot))
+        self._expected = simulate.step(held, joint)
+        return joint
+
+
+def make_planner(name: str, *, policy: Path | None = None, objective: Objective = "makespan",
+                 decode: str = "argmax") -> Planner:
+    """`policy`, `exact` or `greedy`. Raises InputError for what cannot be.
+
+    `policy` is the file of the planner `policy`; `decode` is argmax, sample or best-of-K.
+    """
+    if name == "exact":
+        from moonteam.planners.exact import ExactPlanner
+
+        return ExactPlanner(objective)
+    if name == "greedy":
+        from moonteam.planners.greedy import GreedyPlanner
+
+        return GreedyPlanner(objective)
+    if name != "policy" or policy is None:
+        raise InputError("--planner", f"{name!r} is not one of {', '.join(PLANNERS)}")
+    from moonteam.evaluation.decode import parse
+
+    how = parse(decode)
+    if how.rollouts > 1:
+        return BestOfPlanner(Policy.load(policy), how.rollouts, objective)
+    return LearnedPlanner.load(policy, decode="sample" if how.sample else "argmax")
