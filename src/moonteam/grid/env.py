@@ -124,20 +124,21 @@ def renew(config: EnvConfig, key: Array, states: State, ended: Array,
     start = draw or (lambda k: reset(config, k)[0])
     num_envs = ended.shape[0]
     few = max(1, num_envs // 16)
-    rank = jnp.cumsum(ended) - 1  # [E] place of each ended episode among the ended
 
-    def fresh_states(count: int) -> State:
+    def fresh(count: int) -> State:
         return jax.vmap(start)(jax.random.split(key, count))
 
-    def from_few() -> State:
-        fresh = fresh_states(few)
-        index = jnp.clip(rank, 0, few - 1)
-        return jax.tree.map(lambda x: x[index], fresh)
+    def by_few() -> State:
+        index = jnp.nonzero(ended, size=few, fill_value=num_envs)[0]
+        return jax.tree.map(lambda new, old: old.at[index].set(new, mode="drop"),
+                            fresh(few), states)
 
-    fresh = jax.lax.cond(rank[-1] < few, from_few, lambda: fresh_states(num_envs))
-    return jax.tree.map(
-        lambda new, old: jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-        fresh, states)
+    def by_all() -> State:
+        chosen = lambda new, old: jnp.where(
+            ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+        return jax.tree.map(chosen, fresh(num_envs), states)
+
+    return jax.lax.cond(jnp.sum(ended) <= few, by_few, by_all)
 
 
 def _displacement(actions: Array) -> Array:
