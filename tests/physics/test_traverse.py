@@ -89,7 +89,7 @@ def test_routes_keep_off_walls_and_boulders():
 
 
 def test_impossible_routes_are_refused(monkeypatch):
-    monkeypatch.setattr(traverse, "DRAWS", 40)
+    monkeypatch.setattr(traverse, "BATCHES", 1)
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match="too small"):
         traverse.draw_routes(KINDS["drone"], site(), 1, 60.0, rng)

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from moonteam.errors import InputError
 from moonteam.physics.backends import make_backend
 from moonteam.physics.scene import Placement, build_scene, start_pose
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
 from moonteam.terrain.site import Site
+from moonteam.terrain.traversability import POINT_SPACING, STRAY, limits_of, passable
 
 ARRIVAL = 0.25  # m from the goal: what the executor calls arrived on cells of 1 m
 FALLEN_TILT, FALLEN_SECONDS = math.radians(60.0), 2.0
@@ -31,8 +30,7 @@ REST_SECONDS = 3.0  # still watched after the arrival, to see where it comes to 
 PATIENCE = 4.0  # times the time at the kind's own speed
 LOG_EVERY = 5  # control steps
 MARGIN = 3.0  # m from the site's border
-STEP = 0.25  # m between the points where a route is checked
-DRAWS = 2000
+BATCHES, BATCH = 20, 100  # routes drawn at most, routes judged at once
 
 Outcome = Literal["arrived", "fallen", "stuck", "late", "diverged"]
 
@@ -80,49 +78,38 @@ def draw_routes(
     half = np.array(site.extent) - MARGIN
     if math.hypot(*(2 * half)) < length or (half <= 0).any():
         raise InputError(f"site {site.name}", f"too small for {length:g} m traverses", "extent")
-    passable = _passable(kind, site)
     routes: list[Route] = []
-    for draw in range(1, DRAWS + 1):
-        start = rng.uniform(-half, half)
-        heading, yaw = rng.uniform(-math.pi, math.pi, 2)
-        goal = start + length * np.array([math.cos(heading), math.sin(heading)])
-        route = Route((float(start[0]), float(start[1])), (float(goal[0]), float(goal[1])),
-                      float(yaw))
-        if (np.abs(goal) <= half).all() and passable(route):
-            routes.append(route)
-        if len(routes) == count:
-            return routes, draw
-    raise InputError(f"site {site.name}", f"only {len(routes)} of {count} routes of {length:g} m "
-                     f"that a {kind.name} robot may take in {DRAWS} draws", "site")
+    for batch in range(BATCHES):
+        start = rng.uniform(-half, half, (BATCH, 2))
+        heading, yaw = rng.uniform(-math.pi, math.pi, (2, BATCH))
+        goal = start + length * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        able = (np.abs(goal) <= half).all(axis=1) & _passable(kind, site, start, goal)
+        for draw in np.flatnonzero(able):
+            routes.append(Route(_pair(start[draw]), _pair(goal[draw]), float(yaw[draw])))
+            if len(routes) == count:
+                return routes, batch * BATCH + int(draw) + 1
+    raise InputError(f"site {site.name} {site.seed}", f"only {len(routes)} of {count} routes of "
+                     f"{length:g} m that a {kind.name} robot may take in {BATCHES * BATCH} draws")
 
 
-def _passable(kind: RobotKind, site: Site) -> Callable[[Route], bool]:
-    """Whether slope and boulders along a route are within what the kind can do."""
-    surface = site.surface
-
-    @jax.jit
-    def look(points: Array) -> tuple[Array, Array]:
-        normal = surface.plane(points, kind.footprint)[1]
-        return jnp.arccos(jnp.clip(normal[:, 2], -1.0, 1.0)), surface.height(points)
-
-    def check(route: Route) -> bool:
-        start, goal = np.array(route.start), np.array(route.goal)
-        points = start + np.linspace(0.0, 1.0, _samples(route))[:, None] * (goal - start)
-        slope, ground = (np.asarray(a) for a in look(jnp.asarray(points, jnp.float32)))
-        if slope.max() > kind.max_slope:
-            return False
-        for boulder in site.boulders:
-            near = np.linalg.norm(points - boulder.centre[:2], axis=1)
-            reach = np.array([boulder.reach(float(z)) for z in ground])
-            if ((reach > 0) & (near < reach + kind.footprint + STEP)).any():
-                return False
-        return True
-
-    return check
+def _pair(xy: np.ndarray) -> tuple[float, float]:
+    return float(xy[0]), float(xy[1])
 
 
-def _samples(route: Route) -> int:
-    return math.ceil(math.dist(route.start, route.goal) / STEP) + 1
+def _passable(kind: RobotKind, site: Site, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Which lines from start [D, 2] to goal [D, 2] m traversability opens to the kind: [D].
+
+    The robot may stray to either side, and it must be able to stand at both ends.
+    """
+    limits = limits_of(kind.name)
+    way = goal - start
+    length = float(np.linalg.norm(way[0]))
+    aside = STRAY / length * np.stack([-way[:, 1], way[:, 0]], axis=1)
+    share = np.linspace(0.0, 1.0, math.ceil(length / POINT_SPACING) + 1)
+    line = start[:, None] + share[:, None] * way[:, None]  # [D, S, 2]
+    points = np.concatenate([line - aside[:, None], line, line + aside[:, None]], axis=1)
+    ends = passable(site, np.stack([start, goal], axis=1), replace(limits, flies=False))
+    return np.all(passable(site, points, limits), axis=1) & np.all(ends, axis=1)
 
 
 def run_traverses(
