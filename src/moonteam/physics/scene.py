@@ -57,6 +57,7 @@ class Scene:
     surface: Surface
     site: Site
     qpos0: np.ndarray  # [nq] every robot standing at its start
+    spec: mujoco.MjSpec  # what the model was compiled from
 
 
 def build_scene(
@@ -93,14 +94,14 @@ def build_scene(
         spec.worldbody.add_frame().attach_body(
             robot.body(placement.kind.base), placement.name + "/", "")
     model = spec.compile()
-    _set_heights(model, site.heights)
+    set_heights(model, site.heights)
     check_collisions(model)
     robots = tuple(_find_robot(model, placement) for placement in placements)
     qpos0 = model.qpos0.copy()
     for robot, placement in zip(robots, placements, strict=True):
         qpos0[robot.qpos] = start_pose(site, placement)
     # model.qpos0 stays: it is where joint angles are measured from, not only a start.
-    return Scene(model, robots, site.surface, site, qpos0)
+    return Scene(model, robots, site.surface, site, qpos0, spec)
 
 
 def start_pose(site: Site, placement: Placement) -> np.ndarray:
@@ -207,8 +208,11 @@ def vertical_range(heights: np.ndarray) -> float:
     return float(2.0 ** math.ceil(math.log2(max(1.0, float(np.ptp(heights))))))
 
 
-def _set_heights(model: mujoco.MjModel, heights: np.ndarray) -> None:
-    """Writes the elevations; the compiler would stretch them to the full scale."""
+def set_heights(model: mujoco.MjModel, heights: np.ndarray) -> None:
+    """Writes a site's elevations [ny, nx] m into a compiled scene.
+
+    The compiler itself would stretch them to the full scale.
+    """
     scaled = (heights.astype(np.float64) - float(heights.min())) / vertical_range(heights)
     model.hfield_data[:] = scaled.astype(np.float32).ravel()
 
@@ -217,7 +221,7 @@ def _add_boulder(spec: mujoco.MjSpec, index: int, boulder: Boulder, friction: fl
     spec.worldbody.add_geom(
         name=f"boulder{index}", type=GEOM.mjGEOM_SPHERE, size=[boulder.radius, 0, 0],
         pos=boulder.centre, contype=3, conaffinity=0, condim=3, priority=1,
-        friction=[friction, 0.005, 0.0001], rgba=[0.4, 0.4, 0.4, 1])
+        friction=[friction, 0.005, 0.0001], group=3)
 
 
 def _find_robot(model: mujoco.MjModel, placement: Placement) -> SceneRobot:

@@ -97,10 +97,12 @@ def ground_under(site: Site, xy: npt.NDArray[np.floating], radius: float
 def boulder_distance(site: Site, xy: npt.NDArray[np.floating]) -> FloatMap:
     """Distance [...] m from points xy [..., 2] to the nearest boulder; infinite if none."""
     nearest = np.full(xy.shape[:-1], np.inf)
-    for boulder in site.boulders:
-        at = jnp.asarray(boulder.centre[:2], jnp.float32)
-        reach = boulder.reach(float(site.surface.height(at)))
-        gap = np.linalg.norm(xy - boulder.centre[:2], axis=-1) - reach
+    if not site.boulders:
+        return nearest
+    centres = np.stack([boulder.centre for boulder in site.boulders])
+    ground = np.asarray(site.surface.height(jnp.asarray(centres[:, :2], jnp.float32)))
+    for boulder, level in zip(site.boulders, ground, strict=True):
+        gap = np.linalg.norm(xy - boulder.centre[:2], axis=-1) - boulder.reach(float(level))
         nearest = np.minimum(nearest, gap)
     return nearest
 
@@ -143,11 +145,14 @@ def _plane_and_step(surface: Surface, xy: jax.Array, radius: float
                     ) -> tuple[jax.Array, jax.Array]:
     height, normal = surface.plane(xy, radius)
     slope = jnp.arccos(jnp.clip(normal[..., 2], -1.0, 1.0))
-    step = jnp.zeros_like(height)
-    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
-        for share in (0.5, 1.0):
-            offset = share * radius * jnp.array([np.cos(angle), np.sin(angle)], jnp.float32)
-            at = xy + offset.reshape((1,) * (xy.ndim - 1) + (2,))
-            plane = height - (normal[..., :2] @ offset) / normal[..., 2]
-            step = jnp.maximum(step, jnp.abs(surface.height(at) - plane))
-    return slope, step
+    offsets = (radius * jnp.asarray(_RINGS)).reshape((1,) * (xy.ndim - 1) + _RINGS.shape)
+    ground = surface.height(xy[..., None, :] + offsets)
+    gradient = normal[..., None, :2] / normal[..., None, 2:]
+    plane = height[..., None] - jnp.sum(gradient * offsets, axis=-1)
+    return slope, jnp.abs(ground - plane).max(axis=-1)
+
+
+_RINGS = np.array(
+    [[share * np.cos(angle), share * np.sin(angle)] for share in (0.0, 0.5, 1.0)
+     for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False)], np.float32)
+"""Points [36, 2] of a disc of radius 1."""
