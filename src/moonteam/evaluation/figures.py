@@ -58,3 +58,33 @@ def bars(path: Path, document: dict, panels: Sequence[tuple[str, str, float]]) -
     figure.suptitle(document["title"], fontsize=11, x=0.01, ha="left", color=INK)
     with files.replacing(path) as temporary:
         figure.savefig(temporary, dpi=150)
+
+
+LINES = {"exact(makespan)": ("#2867b2", "-", "o"), "exact(moves)": ("#2867b2", "--", "s"),
+         "exact(weighted)": ("#2867b2", ":", "^"), "greedy(makespan)": ("#3a8f5c", "-", "o"),
+         "exhaustive(makespan)": ("#8a8f98", "-", "x")}
+
+
+def timing(path: Path, document: dict) -> None:
+    """Median seconds against the number of targets, logarithmic, 10 to 90 % shaded."""
+    figure, (axis,) = _axes(7.6, 5.0, 1)
+    rows = document["rows"]
+    policy = iter(("-", "--", ":"))
+    for name in dict.fromkeys(row["planner"] for row in rows):
+        part = [row for row in rows if row["planner"] == name]
+        color, style, mark = LINES.get(name) or (ORANGE, next(policy, "-."), "d")
+        places = [row["targets"] for row in part]
+        axis.plot(places, [row["seconds"] for row in part], style, color=color, marker=mark,
+                  ms=5, label=name)
+        axis.fill_between(places, [row["p10"] for row in part], [row["p90"] for row in part],
+                          color=color, alpha=0.10, lw=0)
+    axis.set_yscale("log")
+    axis.set_xticks(sorted({row["targets"] for row in rows}))
+    axis.set_xlabel("targets")
+    axis.set_ylabel("seconds a call (median, 10 to 90 %)")
+    axis.grid(alpha=0.25, which="both")
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.suptitle(document["title"], fontsize=11, x=0.01, ha="left", color=INK)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150)

@@ -148,3 +148,37 @@ def save(folder: Path, document: dict, columns: Sequence[Column]) -> None:
     files.write_text(folder / "summary.csv", table_csv(document))
     files.write_text(folder / "rows.csv", rows_csv(document))
     files.write_text(folder / "table.md", markdown(document, columns) + "\n")
+
+
+def plain_markdown(document: dict, tables: Sequence[tuple[list[str], list[list[str]]]]) -> str:
+    """Tables of plain cells (titles, rows), with command, notes and machine."""
+    lines = [f"`{document['meta']['command']}`", ""]
+    for titles, rows in tables:
+        lines += ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
+        lines += ["| " + " | ".join(row) + " |" for row in rows] + [""]
+    lines += [f"- {note}" for note in document["notes"]]
+    return "\n".join([*lines, f"- {hardware_line(document['meta'])}"])
+
+
+def show_plain(document: dict, tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
+    """The same on the terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for titles, rows in tables:
+        table = Table(*titles)
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    for note in (*document["notes"], hardware_line(document["meta"])):
+        console.print(note, highlight=False, markup=False)
+
+
+def plain_csv(rows: Sequence[dict]) -> str:
+    """Flat rows as CSV; the keys of the first are the header."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()

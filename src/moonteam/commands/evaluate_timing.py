@@ -1,0 +1,81 @@
+"""`moonteam evaluate timing`: how long planners think, against the number of targets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from moonteam import compilation, files, paths
+from moonteam.commands.evaluate_grid import Many, command_line
+
+
+@dataclass(frozen=True)
+class Args:
+    """Measure planning time on this machine: exact, greedy and exhaustive search, and a policy.
+
+    Whole plans and single decisions are kept apart, and first calls (compiling) from later
+    ones. The text under the table says where the exact planner is faster; it is computed from
+    the measurements. Run it on a quiet machine.
+
+    Examples:
+      moonteam evaluate timing
+      moonteam evaluate timing --policy small --targets 5 --targets 7 --count 20 --json
+    """
+
+    targets: Many[tuple[int, ...]] = ()
+    """Number of targets; again for more sizes. Default: 3 to 10 and 12."""
+    policy: str | None = None
+    """Policy file or bundled policy. A recurrent network is rebuilt, untrained, for each number
+    of targets; without a file it is the paper's."""
+    count: int = 50
+    """Random scenarios a size."""
+    agents: int = 3
+    """Agents of each scenario."""
+    side: int = 32
+    """Cells of a side of the map."""
+    best_of: int = 16
+    """K of the policy's best-of-K plan."""
+    budget: float = 10.0
+    """Seconds that a planner may spend on a size; it then has fewer calls to take a median of."""
+    seed: int = 0
+    """Seed of the scenarios."""
+    json: bool = False
+    """Print one JSON document and nothing else."""
+    markdown: bool = False
+    """Print the table as Markdown and nothing else."""
+    out: Path | None = None
+    """Folder for report.json, timing.csv, table.md and timing.png."""
+
+
+def run(args: Args) -> int:
+    """Measures, prints, saves."""
+    compilation.enable_cache()
+    from moonteam.evaluation import figures, report, timing
+    from moonteam.planners.learned import Policy
+
+    sizes = timing.Sizes(args.targets or (3, 4, 5, 6, 7, 8, 9, 10, 12), args.count, args.agents,
+                         args.side, budget=args.budget, best_of=args.best_of, seed=args.seed)
+    sizes.check()
+    policy = Policy.load(paths.find(args.policy, "policies", ".safetensors")) \
+        if args.policy else None
+    command = command_line("evaluate timing", [], {
+        "targets": args.targets, "policy": args.policy,
+        "count": args.count if args.count != 50 else None,
+        "agents": args.agents if args.agents != 3 else None,
+        "side": args.side if args.side != 32 else None,
+        "best-of": args.best_of if args.best_of != 16 else None,
+        "budget": args.budget if args.budget != 10.0 else None, "seed": args.seed or None})
+    document = timing.evaluate(policy, sizes, command)
+    tables = [timing.pivot(document)]
+    if args.out:
+        files.write_json(args.out / "report.json", document)
+        files.write_text(args.out / "timing.csv", report.plain_csv(document["rows"]))
+        files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
+        figures.timing(args.out / "timing.png", document)
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(report.plain_markdown(document, tables))
+    else:
+        report.show_plain(document, tables)
+    return 0
