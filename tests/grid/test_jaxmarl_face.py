@@ -3,7 +3,6 @@
 import inspect
 import subprocess
 import sys
-import warnings
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +18,10 @@ PUBLIC = ("reset", "step", "step_env", "get_obs", "observation_space", "action_s
 
 @pytest.fixture(scope="module")
 def jaxmarl():
-    """JaxMARL's modules; importing it warns about packages of its own."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import jaxmarl.environments.multi_agent_env as base
-        import jaxmarl.environments.spaces as spaces
-        import jaxmarl.wrappers.baselines as wrappers
+    """JaxMARL's modules; importing them prints, which is not wanted where nobody asks."""
+    import jaxmarl.environments.multi_agent_env as base
+    import jaxmarl.environments.spaces as spaces
+    import jaxmarl.wrappers.baselines as wrappers
     return {"base": base, "spaces": spaces, "wrappers": wrappers}
 
 
