@@ -79,13 +79,16 @@ def load() -> mujoco.MjSpec:
             body.add_geom(spec.find_default("visual"), type=mujoco.mjtGeom.mjGEOM_CYLINDER,
                           size=[0.045, 0.052, 0.0], quat=[0.70710678, 0.70710678, 0.0, 0.0],
                           material="dark")
+            # A bar across the disc shows from afar that the wheel turns.
+            body.add_geom(spec.find_default("visual"), type=mujoco.mjtGeom.mjGEOM_BOX,
+                          size=[0.016, 0.054, 0.112], material="frame")
     return spec
 
 
-def _wheel_mesh(grousers: int = 14, width: float = 0.10) -> tuple[np.ndarray, np.ndarray]:
+def _wheel_mesh(grousers: int = 18, width: float = 0.10) -> tuple[np.ndarray, np.ndarray]:
     """A toothed disc about the y axis: vertices [n, 3] m and triangles [m, 3]."""
     step = 2.0 * np.pi / grousers
-    tooth = np.array([[0.0, 0.122], [0.68, 0.122], [0.72, WHEEL_RADIUS], [0.96, WHEEL_RADIUS]])
+    tooth = np.array([[0.0, 0.130], [0.80, 0.130], [0.82, WHEEL_RADIUS], [0.98, WHEEL_RADIUS]])
     angle = (np.arange(grousers)[:, None] + tooth[None, :, 0]).ravel() * step
     radius = np.tile(tooth[:, 1], grousers)
     ring = np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1)
