@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import cho_factor, cho_solve
 
 from moonteam.paths import assets
 from moonteam.robots.base import (
@@ -57,26 +56,26 @@ class Gait(NamedTuple):
     heavier robot or another planet needs no other numbers.
     """
 
-    period: float | Array = 0.50  # s
-    duty: float | Array = 0.60  # share of the period that a foot carries
-    height: float | Array = 0.27  # m, base above the ground plane
-    stance: float | Array = 0.175  # m, nominal foothold beside the base
-    length: float | Array = 0.20  # m, nominal foothold ahead of or behind the base
-    clearance: float | Array = 0.07  # m, swing arc above the higher of its ends
-    catch: float | Array = 0.12  # s, foothold moved per unit of velocity error
-    lean: float | Array = 0.0  # m, footholds moved uphill per unit of slope
-    follow: float | Array = 1.0  # share of the ground's slope that the body takes on
+    period: float | Array = 0.56  # s
+    duty: float | Array = 0.555  # share of the period that a foot carries
+    height: float | Array = 0.277  # m, base above the ground plane
+    stance: float | Array = 0.17  # m, nominal foothold beside the base
+    length: float | Array = 0.21  # m, nominal foothold ahead of or behind the base
+    clearance: float | Array = 0.042  # m, swing arc above the higher of its ends
+    catch: float | Array = 0.13  # s, foothold moved per unit of velocity error
+    lean: float | Array = -0.12  # m, footholds moved uphill per unit of slope
+    follow: float | Array = 0.87  # share of the ground's slope that the body takes on
     speed: float | Array = 0.45  # m/s, most it tries
     slow: float | Array = 0.8  # share of speed lost per unit of slope
-    velocity: float | Array = 10.0  # 1/s, velocity feedback
-    push: float | Array = 0.8  # most that velocity feedback asks for, in weights
-    lift: float | Array = 80.0  # 1/s^2, height feedback
+    velocity: float | Array = 11.5  # 1/s, velocity feedback
+    push: float | Array = 0.83  # most that velocity feedback asks for, in weights
+    lift: float | Array = 70.0  # 1/s^2, height feedback
     lift_damping: float | Array = 14.0  # 1/s
-    attitude: float | Array = 160.0  # 1/s^2, attitude feedback
-    attitude_damping: float | Array = 18.0  # 1/s
-    swing: float | Array = 36.0  # rad/s, bandwidth of the swinging foot
-    moment: float | Array = 0.02  # m^2, force error traded against moment error in the split
-    friction: float | Array = 0.6  # friction that the force split relies on
+    attitude: float | Array = 194.0  # 1/s^2, attitude feedback
+    attitude_damping: float | Array = 19.8  # 1/s
+    swing: float | Array = 36.5  # rad/s, bandwidth of the swinging foot
+    moment: float | Array = 0.26  # m^2, moment error traded against force error in the split
+    friction: float | Array = 0.7  # friction that the force split relies on
 
 
 GAIT = Gait()
@@ -85,6 +84,9 @@ TURN_RATE = 0.7  # rad/s, most it turns
 ACCELERATION = 0.6  # m/s^2, most the wanted velocity changes
 NEAR = 0.35  # m, within it the robot steps sideways or backwards instead of turning
 ARRIVED, LEFT = 0.05, 0.18  # m, stands within the first, walks again beyond the second
+SLACK = 0.02  # what the force split gives up of the wrench, per unit of weight on a foot
+PASSES = 3  # of the force split, each on what the friction cones cut from the last
+NEAR_STRAIGHT = 4e-4  # m^2/rad^2, damps swinging legs where the foot can hardly be moved
 LEG_INERTIA = np.array([[0.030, 0.0, 0.0], [0.0, 0.031, 0.002], [0.0, 0.002, 0.0166]])  # kg m^2
 
 
@@ -165,6 +167,7 @@ def control_with(
     torque = jnp.einsum("lij,li->lj", body.jacobian, -forces)
     torque = torque + _swing_torques(gait, state, body, swing, progress, foothold)
     torque = torque.reshape(12)
+    torque = jnp.nan_to_num(torque)
     off = command.lost | (body.rotation[2, 2] < FALLEN)
     torque = jnp.where(off, 0.0, jnp.clip(torque, -TORQUE_LIMIT, TORQUE_LIMIT))
     power = jnp.sum(jnp.maximum(torque * qvel[6:], 0.0))
@@ -256,8 +259,9 @@ def _footholds(
     reach = place - body.at[:2][None, :] - hips
     far = jnp.linalg.norm(reach, axis=1, keepdims=True)
     place = place - reach * jnp.maximum(0.0, 1.0 - 0.18 / (far + 1e-6))
-    # A foot that should carry but hangs in the air goes straight down.
-    place = jnp.where(swing[:, None], place, body.feet[:, :2])
+    # A foot that should carry but hangs just above the ground goes straight down.
+    down = ~swing & (body.gap < 0.03)
+    place = jnp.where(down[:, None], body.feet[:, :2], place)
     ground = surface.height(place)
     return jnp.concatenate([place, ground[:, None] + FOOT_RADIUS - 0.005], axis=1)
 
@@ -286,16 +290,18 @@ def _swing_torques(
     pull = gait.swing**2 * jnp.clip(target - body.feet, -0.1, 0.1)
     pull = pull + 1.6 * gait.swing * (velocity - body.foot_velocity)
     pull = pull + jnp.where(swing[:, None], push, 0.0)
-    torque = _inverse(body.jacobian, pull) @ LEG_INERTIA
+    square = jnp.einsum("lij,lkj->lik", body.jacobian, body.jacobian) + NEAR_STRAIGHT * jnp.eye(3)[None]
+    joints = jnp.einsum("lij,li->lj", body.jacobian, _solve(square, pull))
+    torque = joints @ LEG_INERTIA
     return jnp.where((swing | hanging)[:, None], torque, 0.0)
 
 
-def _inverse(matrix: Array, vector: Array) -> Array:
-    """Solves matrix [L, 3, 3] x = vector [L, 3], damped where the leg is nearly straight."""
+def _solve(matrix: Array, vector: Array) -> Array:
+    """x [n, 3] of matrix [n, 3, 3] x = vector [n, 3], by Cramer's rule."""
     a, b, c = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     det = jnp.sum(a * rows[:, 0], axis=1)
-    return jnp.einsum("lij,lj->li", rows, vector) * (det / (det**2 + 1e-6))[:, None]
+    return jnp.einsum("lij,lj->li", rows, vector) / det[:, None]
 
 
 def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
@@ -326,32 +332,27 @@ def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
 def _stance_forces(gait: Gait, state: LeggedState, body: _Body, swing: Array) -> Array:
     """Force of the ground on each carrying foot [L, 3] N: the wanted wrench, split.
 
-    min |A f - b|^2_S + |f|^2_(1/w): f = w A^T (A w A^T + S^-1)^-1 b, repeated on what the
-    friction cones cut away.
+    min |A f - b|^2_(1/s) + |f|^2_(1/w), so f = w A^T y with (A w A^T + s) y = b, repeated on
+    what the friction cones cut away. The force block of A w A^T is a multiple of the unit
+    matrix (each foot adds w), so that only its 3 x 3 Schur complement needs inverting.
     """
     wanted = _wrench(gait, state, body)
     legs = (state.phase + jnp.asarray(LEG_OFFSETS)) % 1.0
     ease = jnp.clip(jnp.minimum(legs, gait.duty - legs) / 0.06 + 0.15, 0.15, 1.0)
     touch = jnp.clip(1.0 - (body.gap - 0.004) / 0.012, 0.0, 1.0)
-    weight = jnp.where(swing, 0.0, ease * touch)  # [L]
+    weight = jnp.where(swing, 0.0, ease * touch)[:, None]  # [L, 1]
     arms = body.feet - (body.at + body.rotation @ jnp.asarray(CENTRE, jnp.float32))[None, :]
-    x, y, z = arms.T
-    o = jnp.zeros_like(x)
-    cross = jnp.stack([
-        jnp.stack([o, -z, y], axis=1), jnp.stack([z, o, -x], axis=1), jnp.stack([-y, x, o], axis=1)
-    ], axis=1)  # fmt: skip
-    eye = jnp.broadcast_to(jnp.eye(3), (4, 3, 3))
-    grasp = jnp.concatenate([eye, cross], axis=1)  # [L, 6, 3]
-    slack = jnp.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0])
-    slack = slack * jnp.where(jnp.arange(6) < 3, 1.0, 0.02 * gait.moment)
-    matrix = jnp.einsum("l,lij,lkj->ik", weight, grasp, grasp) + jnp.diag(slack)
-    factor = cho_factor(matrix, lower=True)
+    total, lever = jnp.sum(weight) + SLACK, jnp.sum(weight * arms, axis=0)
+    second = (weight * arms).T @ arms - jnp.outer(lever, lever) / total
+    schur = (jnp.trace(second) + SLACK * gait.moment) * jnp.eye(3) - second
     forces = jnp.zeros((4, 3))
-    for _ in range(3):
-        missing = wanted - jnp.einsum("lij,lj->i", grasp, forces)
-        share = cho_solve(factor, missing)
-        forces = forces + weight[:, None] * jnp.einsum("lij,i->lj", grasp, share)
-        forces = _cut(gait, forces, body.normal, weight)
+    for _ in range(PASSES):
+        force = wanted[:3] - jnp.sum(forces, axis=0)
+        moment = wanted[3:] - jnp.sum(jnp.cross(arms, forces), axis=0)
+        turn = _solve(schur[None], (moment - jnp.cross(lever, force) / total)[None])[0]
+        pull = (force - jnp.cross(turn, lever)) / total
+        forces = forces + weight * (pull[None, :] + jnp.cross(turn[None, :], arms))
+        forces = _cut(gait, forces, body.normal, weight[:, 0])
     return forces
 
 

@@ -41,8 +41,8 @@ SPANS: dict[str, tuple[float, float]] = {
     "period": (0.3, 0.7), "duty": (0.52, 0.8), "height": (0.24, 0.32), "stance": (0.15, 0.22),
     "length": (0.17, 0.24), "clearance": (0.03, 0.10), "catch": (0.0, 0.25),
     "lean": (-0.2, 0.3), "follow": (0.5, 1.0), "velocity": (3.0, 20.0), "push": (0.4, 1.2),
-    "lift": (30.0, 200.0), "lift_damping": (5.0, 30.0), "attitude": (60.0, 400.0), "attitude_damping": (8.0, 40.0),
-    "swing": (20.0, 60.0), "moment": (0.005, 1.0), "friction": (0.4, 0.75),
+    "lift": (30.0, 200.0), "lift_damping": (5.0, 30.0),
+    "attitude": (60.0, 400.0), "attitude_damping": (8.0, 40.0), "swing": (20.0, 60.0), "moment": (0.005, 1.0), "friction": (0.4, 0.75),
 }  # fmt: skip
 """What the search may change, and within which limits."""
 
@@ -166,11 +166,11 @@ def course(seed: int) -> Site:
         if word == "across":
             ground = ground + math.tan(math.radians(float(number))) * (y - middle)[:, None]
         if word == "craters":
-            for _ in range(8):
-                at, radius = rng.uniform(-5, 5), rng.uniform(0.4, 1.2)
+            for at in (-3.0, -1.0, 1.0, 3.0):
+                radius = rng.uniform(0.5, 1.0)
                 away = np.hypot(x[None, :] - at, (y - middle)[:, None] - rng.uniform(-1, 1))
-                bowl = np.minimum(0.25 * ((away / radius) ** 2 - 1), 0.0) * radius
-                rim = 0.08 * radius * np.exp(-(((away - radius) / (0.3 * radius)) ** 2))
+                bowl = np.minimum(0.17 * ((away / radius) ** 2 - 1), 0.0) * radius
+                rim = 0.04 * radius * np.exp(-(((away - radius) / (0.4 * radius)) ** 2))
                 ground = ground + bowl + rim
         heights[rows] = ground[rows]
     return site_of(heights, "course")
@@ -203,7 +203,7 @@ def search(generations: int, size: int, seed: int) -> Gait:
     names = list(SPANS)
     low, high = (np.array([SPANS[n][k] for n in names]) for k in (0, 1))
     mean = (np.array([float(getattr(GAIT, n)) for n in names]) - low) / (high - low)
-    spread = np.full(len(names), 0.15)
+    spread = np.full(len(names), 0.1)
     rng = np.random.default_rng(seed)
     for generation in range(generations):
         site = course(seed * 1000 + generation)
@@ -215,7 +215,7 @@ def search(generations: int, size: int, seed: int) -> Gait:
         gaits = GAIT._replace(**{
             n: np.repeat(values[:, k], len(starts)) for k, n in enumerate(names)
         })  # fmt: skip
-        walks = walk(scene, np.tile(starts, (size, 1)), np.tile(goals, (size, 1)), 32.0, gaits)
+        walks = walk(scene, np.tile(starts, (size, 1)), np.tile(goals, (size, 1)), 28.0, gaits)
         scores = score(walks).reshape(size, -1)
         best = draws[np.argsort(-scores.mean(axis=1))[: size // 4]]
         mean = 0.4 * mean + 0.6 * best.mean(axis=0)
