@@ -211,7 +211,7 @@ class Run:
         """Checkpoint now."""
         if self.learner is not None:
             spec = dataclasses.asdict(self.config.spec)
-            about = About(**dataclasses.asdict(self.position), checksum=0, network=spec)
+            about = About(**dataclasses.asdict(self.position), files={}, network=spec)
             self.last_good = checkpoints.save(self.folder, self.learner, about)
         self.last_saved = time.monotonic()
 

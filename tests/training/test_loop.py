@@ -1,0 +1,198 @@
+"""Runs that are stopped, killed, torn and resumed end as one that never was."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from moonteam.cli import main
+from moonteam.errors import InputError
+from training import checkpoints, loop
+from training.config import BOOTSTRAP, REFINEMENT, Config, Phase
+from training.loop import Run, Stop
+
+TINY = Config(
+    "small", Phase(4, 8, 2, BOOTSTRAP), Phase(6, 8, 2, REFINEMENT), num_agents=2, num_targets=2,
+    size=(4, 4), max_steps=8, num_steps=8, width=8, update_epochs=1, chunk_updates=2,
+    eval_every=2, eval_scenarios=8)
+
+
+def words(out, *more):
+    """The command line that trains TINY."""
+    given = {"num-agents": 2, "num-targets": 2, "max-steps": 8, "num-steps": 8, "width": 8,
+             "approach-decay": 0.0075, "gamma": 0.99,
+             "update-epochs": 1, "chunk-updates": 2, "eval-every": 2, "eval-scenarios": 8,
+             "bootstrap.updates": 4, "bootstrap.num-envs": 8, "bootstrap.num-minibatches": 2,
+             "bootstrap.lr": 2e-3, "refinement.ent-coef": 0.01,
+             "refinement.updates": 6, "refinement.num-envs": 8, "refinement.num-minibatches": 2,
+             "refinement.lr": 2e-3}
+    options = [word for key, value in given.items() for word in (f"--{key}", str(value))]
+    return ["train", "small", "--size", "4", "4", *options, "--out", str(out), *more]
+
+
+def bits(run):
+    return jax.tree.leaves(jax.device_get(run.learner.params))
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run."""
+    run = Run(TINY, tmp_path_factory.mktemp("whole"), resume=False)
+    assert run.train(Stop())
+    return run
+
+
+def stopped(out, *at):
+    """A run stopped after so many updates, and gone on with, each time from disk."""
+    for number, updates in enumerate(at):
+        run = Run(TINY, out, resume=number > 0)
+        assert not run.train(Stop(), stop_after=updates)
+    return Run(TINY, out, resume=bool(at))
+
+
+def test_resumed_twice_is_bit_identical(whole, tmp_path):
+    run = stopped(tmp_path, 2, 6)
+    assert run.position.phase == "refinement"
+    assert run.position.total_updates == 6
+    assert run.train(Stop())
+    assert same(bits(run), bits(whole))
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["total_updates"] for row in rows] == [2, 4, 6, 8, 10]
+    assert {"argmax", "sample", "success", "makespan", "rate"} <= rows[1].keys()
+
+
+def test_another_seed_is_another_run(whole, tmp_path):
+    run = Run(dataclasses.replace(TINY, seed=1), tmp_path, resume=False)
+    run.train(Stop())
+    assert not same(bits(run), bits(whole))
+
+
+def test_refinement_keeps_the_weights_and_takes_a_fresh_optimiser(tmp_path):
+    run = stopped(tmp_path, 4)
+    before = bits(run)
+    run.learner = run.begin(1, run.learner.params)
+    assert same(bits(run), before)
+    counts = [leaf for leaf in jax.tree.leaves(run.learner.optimiser) if leaf.ndim == 0]
+    assert counts
+    assert all(int(count) == 0 for count in counts)
+    weights = [run.task(phase).config.weights for _, phase in TINY.phases]
+    assert [(w.SC, w.TC, w.TB) for w in weights] == [(0, 0, 0), (0.3, 0.5, 0.2)]
+
+
+@pytest.mark.parametrize("harm", ["truncate", "flip", "no about", "half about"])
+def test_a_torn_checkpoint_is_passed_over_with_a_warning(whole, tmp_path, harm):
+    stopped(tmp_path, 2, 6)
+    newest = checkpoints.newest(tmp_path / "checkpoints")
+    assert newest.name == "00000006"
+    largest = max((p for p in (newest / "learner").rglob("*") if p.is_file()),
+                  key=lambda p: p.stat().st_size)
+    if harm == "truncate":
+        largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+    elif harm == "flip":
+        data = bytearray(largest.read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        largest.write_bytes(bytes(data))
+    elif harm == "no about":
+        (newest / "about.json").unlink()
+    else:
+        (newest / "about.json").write_text('{"phase": "refi')
+    with pytest.warns(UserWarning, match="00000006 is torn"):
+        run = Run(TINY, tmp_path, resume=True)
+    assert run.position.total_updates == 2
+    assert run.train(Stop())
+    assert same(bits(run), bits(whole))
+
+
+def test_killed_and_resumed_is_bit_identical(whole, tmp_path):
+    """SIGKILL once a checkpoint is there, wherever the process then is."""
+    command = [sys.executable, "-m", "moonteam.cli", *words(tmp_path, "--checkpoint-seconds", "0")]
+    child = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"},
+                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 300
+    while checkpoints.newest(tmp_path / "checkpoints") is None:
+        assert child.poll() is None, child.communicate()[1].decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    child.send_signal(signal.SIGKILL)
+    child.communicate()
+    assert main(words(tmp_path, "--resume", "--checkpoint-seconds", "0")) == 0
+    run = Run(TINY, tmp_path, resume=True)
+    assert run.position.total_updates == 10
+    assert same(bits(run), bits(whole))
+    for name in ("config.json", "metrics.jsonl", "report.json", "curve.png", "policy.safetensors"):
+        assert (tmp_path / name).stat().st_size > 0
+
+
+def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        with loop.stop_on_signals() as stop:
+            assert not stop.asked
+            os.kill(os.getpid(), number)
+            assert stop.asked
+    assert signal.getsignal(signal.SIGTERM) is before
+    run = Run(TINY, tmp_path, resume=False)
+    run.train(Stop(), stop_after=2)
+    again = Run(TINY, tmp_path, resume=True)
+    assert not again.train(Stop(asked=True))
+    assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def test_an_interrupted_command_saves_and_returns_130(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Run, "train", lambda self, stop: False)
+    assert main(words(tmp_path)) == 130
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_not_a_number_names_the_last_good_checkpoint(tmp_path, capsys):
+    run = stopped(tmp_path, 2)
+    poisoned = jax.tree.map(lambda x: x * np.nan, run.learner.params)
+    run.learner = run.learner._replace(params=poisoned)
+    with pytest.raises(loop.Diverged, match=r"not a number; .*checkpoints/00000002"):
+        run.train(Stop())
+    assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
+    stopped(tmp_path, 2)
+    with pytest.raises(InputError, match="already holds a run"):
+        Run(TINY, tmp_path, resume=False)
+    with pytest.raises(InputError, match="gamma: was started with other numbers"):
+        Run(dataclasses.replace(TINY, gamma=0.9), tmp_path, resume=True)
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    stopped(tmp_path, 2)
+    wider = dataclasses.replace(TINY, width=16)
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(InputError, match="another network"):
+        Run(wider, tmp_path, resume=True)
+    arrays = checkpoints.load(tmp_path / "checkpoints")[1]
+    like = jax.eval_shape(lambda: Run(wider, tmp_path / "w", resume=False).begin(0, None))
+    with pytest.raises(InputError, match=r"another network.*this run needs"):
+        checkpoints.unflatten(arrays, like, "here")
+
+
+def test_a_full_disk_names_the_checkpoint_before(tmp_path, monkeypatch):
+    run = stopped(tmp_path, 2)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoints.files, "write_json", full)
+    with pytest.raises(InputError, match=r"No space left on device; the last good .*00000002"):
+        run.save()
+    monkeypatch.undo()
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000002"]
+    assert checkpoints.load(tmp_path / "checkpoints")[0].total_updates == 2
