@@ -1,0 +1,142 @@
+"""`moonteam site`: make or import a piece of lunar ground, measure it, draw it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from moonteam import files
+from moonteam.errors import InputError
+
+
+@dataclass(frozen=True)
+class Args:
+    """Make a site from a preset, or import an elevation model, and preview it.
+
+    Writes heights.npy and heights.tif, site.json (measured slopes, roughness, crater counts
+    against the law), and pictures: hillshade, slope, roughness, traversability by kind.
+
+    Examples:
+      moonteam site --preset mare --seed 3 --size 32 --out runs/site
+      moonteam site --dem moon.tif --size 40 --centre 120 -35 --detrend --out runs/dem
+      moonteam site --dem heights.npy --pixel 1.0 --json
+    """
+
+    preset: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
+    """kind of ground to make; not used with --dem"""
+
+    seed: int = 0
+    """the same seed gives the same ground to the bit"""
+
+    size: float | None = None
+    """side, m; 32 for a preset, all of it for --dem"""
+
+    spacing: float = 0.25
+    """between elevation samples, m"""
+
+    cell: float = 1.0
+    """side of a mission cell, m, for the traversability maps"""
+
+    dem: Path | None = None
+    """elevation model to import: GeoTIFF, or .npy [rows, columns] m with north first"""
+
+    centre: tuple[float, float] = (0.0, 0.0)
+    """of the window, m east and north of the elevation model's centre"""
+
+    pixel: float | None = None
+    """metres a pixel of --dem; needed where the file does not say"""
+
+    band: int = 0
+    """of a GeoTIFF, counted from 0"""
+
+    scale: float = 1.0
+    """multiplies the elevations of --dem, for models not in metres"""
+
+    detrend: bool = False
+    """take the plane of best fit out of --dem"""
+
+    detail: bool = True
+    """add relief finer than --dem, continuing its power spectrum"""
+
+    json: bool = False
+    """print one JSON document and nothing else"""
+
+    out: Path | None = None
+    """folder to write to; without it nothing is written"""
+
+
+def run(args: Args) -> int:
+    """Makes, measures and draws; always 0, bad input raises InputError."""
+    if args.seed < 0:
+        raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
+    if not 0.25 <= args.cell <= 100:
+        raise InputError("--cell", f"{args.cell:g} is not allowed; 0.25 to 100 metres")
+    from moonteam.terrain.measure import measure
+
+    site = _site(args)
+    report = measure(site) | {"traversable": _open_shares(site, args.cell)}
+    if args.out is not None:
+        report["files"] = _write(site, args, report)
+    if args.json:
+        print(files.dump_json(report))
+    else:
+        _show(report)
+    return 0
+
+
+def _site(args: Args) -> Any:
+    from moonteam.terrain.site import import_dem, make_site
+
+    if args.dem is None:
+        return make_site(args.preset, args.seed, args.size or 32.0, args.spacing)
+    return import_dem(args.dem, extent_m=args.size, centre_m=args.centre, pixel_m=args.pixel,
+                      band=args.band, scale=args.scale, detrend=args.detrend,
+                      detail=args.detail, spacing=args.spacing, seed=args.seed)
+
+
+def _open_shares(site: Any, cell_m: float) -> dict[str, float]:
+    """Share of the cells that each kind can cross."""
+    from moonteam.terrain.preview import KINDS, grid_of
+    from moonteam.terrain.traversability import traversability
+
+    maps = traversability(site, grid_of(site, cell_m), cell_m, KINDS)
+    return {kind: round(float(cells.mean()), 4) for kind, cells in maps.items()}
+
+
+def _write(site: Any, args: Args, report: dict[str, Any]) -> list[str]:
+    import numpy as np
+
+    from moonteam.terrain.generate import write_dem
+    from moonteam.terrain.preview import draw_all
+
+    out = args.out or Path()
+    with files.replacing(out / "heights.npy") as temporary:
+        # North first, so that the file can be imported again.
+        np.save(temporary, site.heights[::-1])
+    with files.replacing(out / "heights.tif") as temporary:
+        write_dem(temporary, site.heights, site.spacing)
+    pictures = draw_all(site, out, args.cell)
+    files.write_json(out / "site.json", report)
+    return [str(out / name) for name in ("heights.npy", "heights.tif", "site.json")] + [
+        str(path) for path in pictures]
+
+
+def _show(report: dict[str, Any]) -> None:
+    slope = report["slope_deg"]
+    print(f"{report['name']}, seed {report['seed']}: {report['size_m'][0]:g} by "
+          f"{report['size_m'][1]:g} m, {report['samples'][0]} by {report['samples'][1]} samples")
+    print(f"  relief {report['relief_m']:.2f} m; slope median {slope['p50']:.1f}, 95 % "
+          f"{slope['p95']:.1f}, steepest {slope['p100']:.1f} degrees")
+    print(f"  roughness exponent {report['roughness']['hurst']:.2f}; "
+          f"{report['boulders']['obstacles']} boulders as obstacles, "
+          f"{report['boulders']['in_ground']} small ones in the ground")
+    for row in report["craters"]:
+        to = f"to {row['to_m']:g} m" if row["to_m"] else "m and more"
+        low, high = row["poisson_95"]
+        print(f"  craters {row['from_m']:g} {to}: {row['counted']} "
+              f"(law: {row['expected']:.1f}, 95 % of draws {low} to {high})")
+    print("  open cells: " + ", ".join(
+        f"{kind} {100 * share:.1f} %" for kind, share in report["traversable"].items()))
+    for name in report.get("files", []):
+        print(f"  {name}")

@@ -1,0 +1,113 @@
+"""Pictures of a site from above: hillshade, slope, roughness, where each kind can go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from moonteam import files
+from moonteam.terrain import traversability
+from moonteam.terrain.measure import roughness_map, slope_map
+from moonteam.terrain.site import Site
+
+EDGE = 1.0
+"""Ground kept free around the grid, m: no robot can stand on the very edge."""
+
+KINDS = ("drone", "legged", "wheeled")
+
+
+def draw_all(site: Site, folder: Path, cell_m: float) -> list[Path]:
+    """Writes hillshade.png, slope.png, roughness.png and traversability.png; their paths."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    slope = np.degrees(slope_map(site, site.spacing))
+    return [
+        _draw(site, folder / "hillshade.png", f"{site.name}, seed {site.seed}: height, m",
+              site.heights, "gray", shaded=True),
+        _draw(site, folder / "slope.png", "slope, degrees", slope, "inferno", limits=(0, 30)),
+        _draw(site, folder / "roughness.png", "roughness over 1 m: rms about the plane, m",
+              roughness_map(site), "viridis"),
+        _draw_traversability(site, folder / "traversability.png", cell_m),
+    ]
+
+
+def hillshade(site: Site, azimuth_deg: float = 315.0, elevation_deg: float = 25.0) -> np.ndarray:
+    """Brightness [ny, nx] 0 to 1 of the ground under a low sun, row 0 in the south."""
+    from matplotlib.colors import LightSource
+
+    light = LightSource(azimuth_deg, elevation_deg)
+    # matplotlib expects row 0 in the north.
+    return light.hillshade(site.heights[::-1], dx=site.spacing, dy=site.spacing)[::-1]
+
+
+def grid_of(site: Site, cell_m: float) -> tuple[int, int]:
+    """Size (W, H) of the largest grid of cells that fits on the site, a little off its edge."""
+    width, height = (max(1, int((2 * half - 2 * EDGE) / cell_m + 1e-6)) for half in site.extent)
+    return width, height
+
+
+def _box(site: Site) -> tuple[float, float, float, float]:
+    x, y = site.extent
+    return (-x, x, -y, y)
+
+
+def _draw(site: Site, path: Path, title: str, values: np.ndarray, colors: str, *,
+          limits: tuple[float, float] | None = None, shaded: bool = False) -> Path:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    axes = figure.subplots()
+    low, high = limits or (float(values.min()), float(values.max()))
+    place: dict[str, Any] = {"origin": "lower", "extent": _box(site)}
+    shown = axes.imshow(values, cmap=colors, vmin=low, vmax=high, **place)
+    if shaded:
+        axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, **place)
+        axes.contour(values, levels=8, colors="tab:orange", linewidths=0.6, **place)
+    _rocks(axes, site)
+    figure.colorbar(shown, ax=axes, shrink=0.85)
+    _finish(figure, axes, title, path)
+    return path
+
+
+def _draw_traversability(site: Site, path: Path, cell_m: float) -> Path:
+    from matplotlib.figure import Figure
+
+    size = grid_of(site, cell_m)
+    times = traversability.travel_times(site, size, cell_m, KINDS)
+    half = (size[0] * cell_m / 2, size[1] * cell_m / 2)
+    figure = Figure(figsize=(12.6, 4.6), layout="constrained")
+    for axes, kind in zip(figure.subplots(1, len(KINDS)), KINDS, strict=True):
+        axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower",
+                    extent=_box(site))
+        seconds = times[kind]
+        open_share = np.isfinite(seconds).mean()
+        color = axes.imshow(np.ma.masked_invalid(seconds), cmap="viridis_r", alpha=0.45,
+                            origin="lower", extent=(-half[0], half[0], -half[1], half[1]))
+        axes.imshow(np.ma.masked_array(np.ones_like(seconds), np.isfinite(seconds)),
+                    cmap="Reds", vmin=0, vmax=1.3, alpha=0.8, origin="lower",
+                    extent=(-half[0], half[0], -half[1], half[1]))
+        _rocks(axes, site)
+        axes.set_title(f"{kind}: {100 * open_share:.1f} % of cells open", fontsize=10)
+        figure.colorbar(color, ax=axes, shrink=0.8, label="s to cross a cell")
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    return path
+
+
+def _rocks(axes: Any, site: Site) -> None:
+    from matplotlib.patches import Circle
+
+    for boulder in site.boulders:
+        axes.add_patch(Circle((float(boulder.centre[0]), float(boulder.centre[1])), boulder.radius, facecolor="none",
+                              edgecolor="deepskyblue", linewidth=1.2))
+
+
+def _finish(figure: Any, axes: Any, title: str, path: Path) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel("east, m")
+    axes.set_ylabel("north, m")
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
