@@ -212,13 +212,13 @@ def _save_paths(film: Film, out: Path) -> None:
 def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:
     """video.mp4, or map.mp4 where there is nothing to render with, with a word about why."""
     from moonteam.physics.render import RenderingUnavailable
-
     from sim2grid.film import write
     from sim2grid.views import SceneViews
 
-    path = out / "video.mp4"
+    path, views = out / "video.mp4", None
     try:
-        film = film.with_views(SceneViews(prepared, film))
+        views = SceneViews(prepared, film)
+        film = film.with_views(views)
     except RenderingUnavailable as error:
         print(f"moonteam: {error}", file=sys.stderr)
         print("moonteam: no 3-D video; making map.mp4 instead", file=sys.stderr)
@@ -232,6 +232,8 @@ def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:
             update(count, path.name)
 
         write(film, path, drawn)
+    if views is not None:
+        views.shut()
     return path
 
 

@@ -44,6 +44,8 @@ SPEEDS = (0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40,
 MARGIN = 10
 CLOSE = (168, 112)  # size of a robot's close view
 MAX_CLOSE = 3
+FREE = (MARGIN, MARGIN, WIDTH - 220, HEIGHT - CLOSE[1] - 2 * MARGIN)
+"""Left, top, right, bottom of what no map, list or close view covers."""
 
 
 @dataclass(frozen=True)

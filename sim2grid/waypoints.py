@@ -1,9 +1,8 @@
 """The grid to physics: a point in its goal cell for each robot.
 
 A waypoint is the centre of the robot's cell. Where several robots that stand on the ground
-are bound for one cell, each gets its own quarter, so that
-a target that needs two of them does not ask for two bodies in one place. Flyers keep to the
-centre: they pass above.
+are bound for one cell, each gets its own quarter, so that a target that needs two of them does not
+ask for two bodies in one place. Flyers keep to the centre: they pass above.
 """
 
 from __future__ import annotations

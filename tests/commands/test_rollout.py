@@ -1,0 +1,118 @@
+"""`moonteam rollout`: bad missions are refused before anything is written; a real one runs."""
+
+import json
+
+import pytest
+
+from moonteam.cli import main
+
+GOOD = """
+map: {size: [3, 3], cell_m: 1.0}
+site: {preset: flat}
+robots:
+  - {name: hop, kind: drone, skills: [A], start: [0, 0]}
+  - {name: roll, kind: wheeled, skills: [B], start: [1, 0]}
+targets:
+  - {name: both, at: [1, 1], skills: [A, B], type: AND}
+"""
+
+
+def rollout(mission, out, *options):
+    return main(["rollout", str(mission), "--out", str(out), "--planner", "exact",
+                 "--backend", "native", "--no-video", *options])
+
+
+@pytest.mark.parametrize(("old", "new", "named"), [
+    ("robots:", "robbots:", "robbots"),
+    ("cell_m: 1.0", "cell_m: wide", "map.cell_m"),
+    ("at: [1, 1]", "at: [1, 3]", "targets[0].at"),
+    ("start: [1, 0]", "start: [-1, 0]", "robots[1].start"),
+    ("kind: drone", "kind: submarine", "robots[0].kind"),
+    ("skills: [A, B], type", "skills: [A, C], type", "targets[0].skills"),
+    ("name: roll", "name: hop", "robots[1].name"),
+    ("preset: flat", "preset: cheese", "cheese"),
+    ("preset: flat", "seed: 3", "site"),
+    ("robots:", "robots: [", "YAML"),
+    (GOOD, "", "empty"),
+    (GOOD, "- 1\n- 2\n", "mapping"),
+], ids=lambda value: str(value)[:18].strip())
+def test_bad_missions_one_line_code_two_nothing_written(tmp_path, capsys, old, new, named):
+    file, out = tmp_path / "bad.yaml", tmp_path / "out"
+    assert old in GOOD
+    file.write_text(GOOD.replace(old, new))
+    assert rollout(file, out) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert named in captured.err
+    assert not out.exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.yaml"]
+
+
+@pytest.mark.parametrize(("options", "named"), [
+    (["--seed", "-1"], "--seed"),
+    (["--decode", "best-of-many"], "--decode"),
+    (["--planner", "policy", "--policy", "nobody"], "nobody"),
+])
+def test_bad_options_one_line_code_two_nothing_written(tmp_path, capsys, options, named):
+    file, out = tmp_path / "good.yaml", tmp_path / "out"
+    file.write_text(GOOD)
+    assert rollout(file, out, *options) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert named in captured.err
+    assert not out.exists()
+
+
+def test_a_missing_mission_names_the_bundled_ones(tmp_path, capsys):
+    assert rollout("nowhere", tmp_path / "out") == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "demo" in message
+    assert "outpost" in message
+    assert rollout(tmp_path / "nowhere.yaml", tmp_path / "out") == 2
+    assert "no such file" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_out_that_is_a_file_is_refused(tmp_path, capsys):
+    file = tmp_path / "good.yaml"
+    file.write_text(GOOD)
+    assert rollout(file, file) == 2
+    assert "is a file" in capsys.readouterr().err
+    assert file.read_text() == GOOD
+
+
+def test_real_robots_solve_a_tiny_mission_and_the_same_seed_gives_the_same_report(
+        tmp_path, capsys):
+    file = tmp_path / "tiny.yaml"
+    file.write_text(GOOD)
+    assert rollout(file, tmp_path / "one", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["success"]
+    assert report["mission"] == "tiny"
+    target = report["targets"][0]
+    assert target["solved"]
+    assert target["robots"] == ["hop", "roll"]
+    assert all(distance <= 0.5 for distance in target["distance_m"])
+    assert report["grid_plan"]["makespan"] <= target["decision"]
+    assert [robot["falls"] for robot in report["robots"]] == [0, 0]
+    assert all(robot["distance_m"] > 0.5 for robot in report["robots"])
+    assert report["robots"][0]["propellant_kg"] > 0
+    one = tmp_path / "one"
+    assert {p.name for p in one.iterdir()} == {
+        "report.json", "timing.json", "config.json", "paths.png"}
+    assert json.loads((one / "report.json").read_text()) == report
+
+    assert rollout(file, tmp_path / "two") == 0
+    assert (tmp_path / "two" / "report.json").read_bytes() == (one / "report.json").read_bytes()
+    assert "solved at decision" in capsys.readouterr().out
+
+
+def test_a_failed_mission_exits_with_one_and_still_reports(tmp_path, capsys):
+    file = tmp_path / "hasty.yaml"
+    file.write_text("max_steps: 1\n" + GOOD.replace("start: [1, 0]", "start: [2, 2]"))
+    assert rollout(file, tmp_path / "out") == 1
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (report["success"], report["cause"], report["decisions"]) == (False, "max_steps", 1)
+    assert "FAILED" in capsys.readouterr().out
