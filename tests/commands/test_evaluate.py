@@ -1,0 +1,198 @@
+"""The tables as a user gets them: from a command line to report, CSV, Markdown and figure."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from moonteam.cli import main
+from moonteam.evaluation import env_speed, timing
+from moonteam.policies import checkpoint, recurrent
+from moonteam.policies.recurrent import RecurrentSpec
+
+GOLDEN = Path("tests/golden/certified_optima.jsonl")
+KEYS = {"success", "makespan", "moves", "M_st", "M_tte", "st_ratio", "tte_ratio",
+        "makespan_gap", "moves_gap", "decisions"}
+
+
+def output(capsys, *words):
+    assert main(list(words)) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def without_times(document):
+    """What must be the same whenever the same command runs."""
+    return {"rows": document["rows"], "notes": document["notes"], "summary": [
+        {k: v for k, v in row.items() if "seconds" not in k} for row in document["summary"]]}
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    spec = RecurrentSpec(num_agents=3, num_targets=5, size=(32, 32), width=8)
+    shapes = jax.eval_shape(lambda key: recurrent.init(spec, key), jax.random.key(0))
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda x: rng.normal(0, 0.5, x.shape).astype(np.float32), shapes)
+    path = tmp_path_factory.mktemp("policy") / "tiny.safetensors"
+    config = {"num_agents": 3, "num_targets": 5, "size": [32, 32], "width": 8}
+    checkpoint.save_policy(path, checkpoint.PolicyFile("recurrent", config, params))
+    return str(path)
+
+
+def test_exact_is_optimal_in_both_objectives_and_greedy_never_better(capsys, tmp_path):
+    words = ("evaluate", "grid", str(GOLDEN), "--limit", "10", "--planner", "exact", "--planner",
+             "greedy", "--objective", "makespan", "--objective", "moves", "--json")
+    document = output(capsys, *words, "--out", str(tmp_path / "run"))
+    summary = {row["planner"]: row for row in document["summary"]}
+    assert list(summary) == ["exact(makespan)", "exact(moves)", "greedy(makespan)",
+                             "greedy(moves)"]
+    assert summary["exact(makespan)"]["makespan_gap"] == 0.0
+    assert summary["exact(moves)"]["moves_gap"] == 0.0
+    assert all(row["success"] == 1.0 for row in summary.values())
+    assert all(set(row["intervals"]) == KEYS and set(row) >= KEYS for row in summary.values())
+    assert len(document["rows"]) == 40
+    for row in document["rows"]:
+        assert set(row) == {"id", "planner", "success", "makespan", "moves", "optimal"}
+        assert row["makespan"] >= row["optimal"]["makespan"]
+        assert row["moves"] >= row["optimal"]["moves"]
+    assert set(document["meta"]) == {"command", "seed", "commit", "versions", "hardware"}
+    files = {p.name for p in (tmp_path / "run").iterdir()}
+    assert files == {"report.json", "summary.csv", "rows.csv", "table.md", "gaps.png"}
+    assert json.loads((tmp_path / "run" / "report.json").read_text()) == document
+    assert (tmp_path / "run" / "rows.csv").read_text().count("\n") == 41
+    assert (tmp_path / "run" / "gaps.png").read_bytes()[:4] == b"\x89PNG"
+    table = (tmp_path / "run" / "table.md").read_text()
+    assert table.startswith("`moonteam evaluate grid")
+    assert "| exact(makespan) | 1.000 [1.000, 1.000] |" in table
+    # The same command, the same report, but for the times.
+    assert without_times(output(capsys, *words)) == without_times(document)
+
+
+def test_policies_stand_beside_planners(capsys, policy, tmp_path):
+    lines = [line for line in GOLDEN.read_text().splitlines() if '"3r5t' in line][:4]
+    small = tmp_path / "small.jsonl"
+    small.write_text("\n".join(lines))
+    document = output(capsys, "evaluate", "grid", str(small), "--planner", "policy", "--policy",
+                      policy, "--decode", "argmax", "--decode", "best-of-2", "--json")
+    assert [row["planner"] for row in document["summary"]] == [
+        "policy(argmax)", "policy(best-of-2)"]
+    for row in document["rows"]:
+        assert (row["makespan"] is None) == (not row["success"])
+    assert any("deadlock watch" in note for note in document["notes"])
+    assert main(["evaluate", "grid", str(small), "--markdown"]) == 0
+    assert "| exact(makespan) |" in capsys.readouterr().out
+    assert main(["evaluate", "grid", str(small)]) == 0
+    assert "makespan gap" in capsys.readouterr().out
+
+
+def test_replanning_has_the_oracle_and_both_forms(capsys, tmp_path):
+    words = ("evaluate", "replanning", "--count", "4", "--planner", "greedy", "--json")
+    document = output(capsys, *words, "--out", str(tmp_path))
+    rows = {row["planner"]: row for row in document["summary"]}
+    assert list(rows) == ["exact(makespan)", "exact(moves)", "greedy(makespan)"]
+    assert rows["exact(makespan)"]["makespan_gap"] == 0.0
+    for row in rows.values():
+        assert row["M_st"] == pytest.approx(128 - row["makespan"])
+        assert row["M_tte"] == pytest.approx(384 - row["moves"])
+    assert (tmp_path / "replanning.png").exists()
+    assert without_times(output(capsys, *words)) == without_times(document)
+
+
+def broken(tmp_path, text):
+    path = tmp_path / "broken.jsonl"
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_broken_line_is_named(capsys, tmp_path):
+    good = GOLDEN.read_text().splitlines()
+    lines = (good * 3)[:400]
+    lines[311] = lines[311][:50]
+    out = tmp_path / "out"
+    path = broken(tmp_path, "\n".join(lines))
+    assert main(["evaluate", "grid", path, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "line 312" in message
+    assert message.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (["--planner", "clever"], "'clever' is not one of exact"),
+    (["--objective", "fun"], "'fun' is not one of makespan"),
+    (["--planner", "policy"], "policy file is needed"),
+    (["--planner", "policy", "--policy", "POLICY"], "made for 3 robots and 5 targets"),
+    (["--planner", "policy", "--policy", "POLICY", "--decode", "best-of-0"], "best-of-K needs"),
+    (["--planner", "policy", "--policy", "POLICY", "--decode", "beam"], "'beam' is not one of"),
+    (["--planner", "policy", "--policy", "POLICY", "--preference", "2"], "0 (time) to 1"),
+    (["--planner", "policy", "--policy", "POLICY", "--temperature", "0"], "above 0"),
+    (["--planner", "policy", "--policy", "nowhere"], "no such file"),
+    (["--planner", "exact", "--policy", "POLICY"], "no effect"),
+    (["--limit", "0"], "at least 1"),
+])
+def test_bad_wishes_get_one_line(words, says, capsys, policy, tmp_path):
+    out = tmp_path / "out"
+    words = [policy if word == "POLICY" else word for word in words]
+    assert main(["evaluate", "grid", str(GOLDEN), *words, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert says in message
+    assert message.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (["--new", "0"], "at least 1"),
+    (["--count", "0"], "at least 1"),
+    ([str(GOLDEN), "--new", "9"], "appear later"),
+    (["--decode", "best-of-4"], "looks ahead"),
+])
+def test_bad_wishes_of_replanning_get_one_line(words, says, capsys, tmp_path):
+    out = tmp_path / "out"
+    assert main(["evaluate", "replanning", *words, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert says in message
+    assert message.count("\n") == 1
+    assert not out.exists()
+
+
+def timed(name, targets, seconds):
+    return {"planner": name, "targets": targets, "seconds": seconds}
+
+
+def test_the_text_under_the_timing_follows_from_the_measurements():
+    rows = [timed(timing.EXACT, 5, 1e-4), timed(timing.EXACT, 10, 2e-2),
+            timed(timing.DECISION, 5, 1e-3), timed(timing.DECISION, 10, 1e-3),
+            timed(timing.PLAN, 5, 3e-2), timed(timing.PLAN, 10, 3e-2),
+            timed("exhaustive(makespan)", 5, 1e-2)]
+    said = timing.findings(rows)
+    assert "sooner than the policy makes one decision at 5 targets (at 5: 100 us" in said[0]
+    assert "longer than the policy makes one decision at 10 targets (at 10: 20 ms" in said[1]
+    assert "sooner than the policy rolls out a whole plan at 5 and 10 targets" in said[2]
+    assert "100 times as long" in said[3]
+    assert len(said) == 4
+
+
+def test_timing_measures_all_of_them(capsys, tmp_path):
+    document = output(capsys, "evaluate", "timing", "--targets", "3", "--count", "2", "--budget",
+                      "0.2", "--side", "8", "--best-of", "2", "--json", "--out", str(tmp_path))
+    names = [row["planner"] for row in document["rows"]]
+    assert names == ["exact(makespan)", "exact(moves)", "exact(weighted)", "greedy(makespan)",
+                     "exhaustive(makespan)", "policy, one decision", "policy, whole plan",
+                     "policy, best of 2 plans"]
+    assert all(0 < row["p10"] <= row["seconds"] <= row["p90"] for row in document["rows"])
+    assert (tmp_path / "timing.png").exists()
+    assert main(["evaluate", "timing", "--targets", "0"]) == 2
+
+
+def test_bench_measures_planner_and_env(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(env_speed, "peer", lambda load: None)
+    document = output(capsys, "bench", "grid", "--targets", "3", "--count", "2", "--envs", "4",
+                      "--agents", "2", "--env-targets", "2", "--steps", "4", "--repeats", "2",
+                      "--json", "--out", str(tmp_path))
+    assert {(r["objective"], r["what"]) for r in document["planner"]} == {
+        (o, w) for o in ("moves", "makespan", "weighted") for w in ("search", "plan")}
+    assert document["env"]["env_steps_per_second"]["moonteam"]["median"] > 0
+    assert document["env"]["ratio"] is None
+    assert any("not installed" in note for note in document["notes"])
+    assert main(["bench", "grid", "--targets", "13"]) == 2
