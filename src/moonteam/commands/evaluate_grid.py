@@ -105,12 +105,12 @@ def run(args: Args) -> int:
     title = f"{Path(args.set).stem}: {len(found)} scenarios"
     document = grid.evaluate(found, rows, args.seed, title, command)
     if args.out:
-        report.save(args.out, document, grid.COLUMNS)
+        report.save(args.out, document, grid.PAGE)
         figures.bars(args.out / "gaps.png", document, grid.PANELS)
     if args.json:
         print(files.dump_json(document))
     elif args.markdown:
-        print(report.markdown(document, grid.COLUMNS))
+        print(report.markdown(document, grid.PAGE))
     else:
         report.show(document, grid.COLUMNS)
     return 0

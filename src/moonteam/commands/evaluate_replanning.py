@@ -99,12 +99,12 @@ def run(args: Args) -> int:
         "time-limit": args.time_limit, "limit": args.limit})
     document = replanning.evaluate(found, rows, args.new, args.seed, title, command)
     if args.out:
-        report.save(args.out, document, replanning.COLUMNS)
+        report.save(args.out, document, replanning.PAGE)
         figures.bars(args.out / "replanning.png", document, replanning.PANELS)
     if args.json:
         print(files.dump_json(document))
     elif args.markdown:
-        print(report.markdown(document, replanning.COLUMNS))
+        print(report.markdown(document, replanning.PAGE))
     else:
         report.show(document, replanning.COLUMNS)
     return 0

@@ -14,6 +14,8 @@ PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
           ("moves_gap", "moves over the optimum, %", 100.0),
           ("success", "success", 1.0))
 COLUMNS = (*report.GRID_COLUMNS, *report.SECONDS)
+PAGE = tuple(c for c in COLUMNS if c.key not in ("M_st", "M_tte", "decisions"))
+"""Columns of the Markdown table, which must not be too wide; the others follow from them."""
 
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int, title: str,

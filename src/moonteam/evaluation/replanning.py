@@ -30,6 +30,7 @@ from moonteam.scenario import Scenario
 
 ORACLE = (("exact", "makespan"), ("exact", "moves"))
 COLUMNS = tuple(column for column in grid.COLUMNS if column.key not in ("st_ratio", "tte_ratio"))
+PAGE = tuple(column for column in COLUMNS if column.key != "decisions")
 PANELS = (("makespan_gap", "T over exact(makespan), %", 100.0),
           ("moves_gap", "moves over exact(moves), %", 100.0),
           ("success", "success", 1.0))
