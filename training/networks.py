@@ -5,6 +5,8 @@ Legend: T steps, E environments, N agents, D observation length, H width, A acti
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -84,3 +86,10 @@ def for_spec(spec: RecurrentSpec, precision: str = "float32") -> Networks:
     dtype = jnp.dtype(jnp.bfloat16) if precision == "bfloat16" else None
     return Networks(recurrent.actor(spec, dtype), recurrent.critic(spec, dtype),
                     tuple(float(s) for s in spec.obs_scale()), spec.num_agents)
+
+
+@contextmanager
+def matmul_precision(precision: str) -> Iterator[None]:
+    """How float32 matrix products are done inside: in full, or as TF32 where the device can."""
+    with jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "float32"):
+        yield
