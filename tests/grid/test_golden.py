@@ -19,6 +19,8 @@ SLOTS, ROWS = 3, 5  # every case is padded to these, so that one compilation ser
 
 step = jax.jit(grid.step, static_argnums=0)
 reset_to = jax.jit(grid.reset_to, static_argnums=0)
+observe_now = jax.jit(grid.observe, static_argnums=0)
+available = jax.jit(grid.available)
 
 
 def wide(rows, length):
@@ -253,9 +255,9 @@ def test_a_lost_agent_solves_nothing_does_not_move_and_is_not_seen():
     assert result.cells.tolist() == [[0, 0], [4, 4]]
     assert not result.solved.any()
     assert result.rewards.SC.tolist() == [0, 0]
-    assert grid.available(lost)[:2].tolist() == [[False, False, False, False, True],
+    assert available(lost)[:2].tolist() == [[False, False, False, False, True],
                                                  [False, True, True, False, True]]
-    seen = grid.observe(CONFIG, replace(lost, cells=lost.cells.at[0].set(3)))[1]
+    seen = observe_now(CONFIG, replace(lost, cells=lost.cells.at[0].set(3)))[1]
     first_other, its_skills = seen[2:4], seen[2 * ROWS + 2 * SLOTS + 1]
     assert not first_other.any()
     assert its_skills == 0
@@ -264,7 +266,7 @@ def test_a_lost_agent_solves_nothing_does_not_move_and_is_not_seen():
 def test_available_actions_are_those_that_are_not_turned_back():
     passable = jnp.ones((1, 5, 5), bool).at[0, 1, 0].set(False)
     state = start(CONFIG, [A, A], [(0, 0), (2, 4)], [((1, 3), A, False)], passable=passable)
-    assert grid.available(state.state)[:2].tolist() == [[False, False, False, True, True],
+    assert available(state.state)[:2].tolist() == [[False, False, False, True, True],
                                               [False, True, True, True, True]]
     result = act(CONFIG, state, UP, UP)
     assert result.cells.tolist() == [[0, 0], [2, 4]]

@@ -62,7 +62,7 @@ def rows(array):
     return [tuple(row) for row in array.tolist()]
 
 
-@pytest.mark.parametrize(("n", "m", "s"), [(2, 2, 2), (3, 1, 2), (2, 1, 3), (1, 2, 2), (2, 2, 1)])
+@pytest.mark.parametrize(("n", "m", "s"), [(2, 2, 2), (3, 1, 2), (2, 1, 3)])
 def test_skills_and_types(n, m, s):
     problem, _ = draw(grid.EnvConfig(num_agents=n, num_targets=m, num_skills=s, width=3, height=3))
     drawn = Counter(zip(rows(problem.agent_skills), rows(problem.target_skills),
@@ -71,7 +71,7 @@ def test_skills_and_types(n, m, s):
 
 
 @pytest.mark.parametrize(("size", "n", "m", "b"), [
-    ((3, 2), 2, 2, 0), ((2, 2), 1, 3, 0), ((3, 2), 1, 2, 1), ((5, 1), 1, 1, 2)])
+    ((3, 2), 2, 2, 0), ((3, 2), 1, 2, 1)])
 def test_cells(size, n, m, b):
     config = grid.EnvConfig(num_agents=n, num_targets=m, num_buffer=b, width=size[0],
                             height=size[1])
@@ -123,19 +123,20 @@ def test_buffered_targets_are_covered_too():
 
 
 def test_large_families_stay_valid():
-    config = grid.EnvConfig(num_agents=8, num_targets=40, num_skills=8, width=16, height=16)
+    config = grid.EnvConfig(num_agents=6, num_targets=24, num_skills=8, width=12, height=12)
     problem, cells = draw(config, count=64)
     team = np.bitwise_or.reduce(problem.agent_skills, axis=1)
     assert not (problem.target_skills & ~team[:, None]).any()
     assert (problem.target_skills > 0).all()
-    assert all(len(set(rows(places))) == 40 for places in problem.target_cells)
+    assert all(len(set(rows(places))) == 24 for places in problem.target_cells)
     taken = (cells[:, :, None] == problem.target_cells[:, None]).all(-1)
     assert not taken.any()
 
 
 def test_renewal_replaces_the_ended_and_only_them():
     config = grid.EnvConfig(num_agents=2, num_targets=3, width=6, height=6)
-    states = jax.vmap(lambda k: grid.reset(config, k)[0])(jax.random.split(jax.random.key(0), 64))
+    resets = jax.jit(jax.vmap(lambda key: grid.reset(config, key)[0]))
+    states = resets(jax.random.split(jax.random.key(0), 64))
     renew = jax.jit(grid.renew, static_argnums=0)
     for ended in (np.arange(64) % 40 == 3, np.ones(64, bool), np.zeros(64, bool)):
         after = renew(config, jax.random.key(5), states, jnp.array(ended))

@@ -55,16 +55,16 @@ def to_problem(scenario: Scenario, num_buffer: int = 0) -> tuple[Problem, Array]
     buffer = None
     if num_buffer:
         buffer = Buffer(jnp.asarray(cells[shown:]), jnp.asarray(skills[shown:]),
-                        jnp.asarray(both[shown:]), jnp.zeros((), jnp.int32))
+                        jnp.asarray(both[shown:]), jnp.asarray(np.zeros((), np.int32)))
     problem = Problem(
         size=jnp.array(scenario.size, jnp.int32),
         agent_skills=jnp.array([scenario.mask(a.skills) for a in scenario.agents], jnp.int32),
         agent_kinds=jnp.asarray(kinds),
-        agent_mask=jnp.ones(len(kinds), bool),
+        agent_mask=jnp.asarray(np.ones(len(kinds), bool)),
         target_cells=jnp.asarray(cells[:shown]),
         target_skills=jnp.asarray(skills[:shown]),
         target_and=jnp.asarray(both[:shown]),
-        target_mask=jnp.ones(shown, bool),
+        target_mask=jnp.asarray(np.ones(shown, bool)),
         passable=None if passable is None else jnp.asarray(passable),
         buffer=buffer)
     return problem, jnp.array([a.at for a in scenario.agents], jnp.int32)
@@ -158,7 +158,7 @@ def stack(problems: Sequence[tuple[Problem, Array]]) -> tuple[Problem, Array]:
         sides = [(max(int(s[1]) for s in sizes), max(int(s[0]) for s in sizes))]
         shape = tuple(map(max, zip(*maps, (kinds, *sides[0]), strict=True)))
     padded = [_pad(p, cells, n, m, shape) for p, cells in problems]
-    return jax.tree.map(lambda *rows: jnp.stack(rows), *padded)
+    return jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows)), *padded)
 
 
 def _pad(problem: Problem, cells: Array, num_agents: int, num_targets: int,
