@@ -128,7 +128,12 @@ def expected_craters(preset: Preset, area: float, smallest: float) -> float:
 
 
 def roughness_exponent(heights: np.ndarray, spacing: float) -> tuple[float, float]:
-    """Hurst exponent and rms height difference m at one sample, by the variogram."""
+    """Hurst exponent and rms height difference m at one sample, by the variogram.
+
+    Not a number and 0 for ground without relief.
+    """
+    if np.ptp(heights) < 1e-6:
+        return math.nan, 0.0
     found = tg.estimate_base_roughness(_raster(heights, spacing), spacing)
     return float(found.hurst), float(found.deviation)
 
@@ -161,19 +166,29 @@ def write_dem(path: str | os.PathLike[str], heights: np.ndarray, spacing: float)
     tg.write_geotiff(path, _raster(heights, spacing))
 
 
+def spectrum(heights: np.ndarray, pixel: float) -> tuple[float, float] | None:
+    """Slope of an elevation model's power spectrum and the rms height m that it puts into the
+    octave just finer than the model; None where the model is too small or flat to say.
+    """
+    try:
+        found = tg.estimate_power_law_spectrum(_raster(heights, pixel))
+    except ValueError:
+        return None
+    return (min(max(found.slope, 2.0), 4.0), found.octave_rms) if found.octave_rms > 0 else None
+
+
 def refine(heights: np.ndarray, pixel: float, shape: tuple[int, int], spacing: float, seed: int,
-           detail: bool) -> np.ndarray:
+           detail: tuple[float, float] | None) -> np.ndarray:
     """Elevations [rows, columns] at `pixel` m resampled to `shape` at `spacing` m, same centre.
 
-    With `detail`, relief finer than the source continues the source's own power spectrum.
+    With `detail`, a spectrum, relief finer than the source's pixels continues it.
     """
     raster = _raster(heights, pixel)
     layers = []
-    if detail and pixel > 2 * spacing:
-        spectrum = tg.estimate_power_law_spectrum(raster)
+    if detail is not None:
         layers.append(tg.SpectralContinuationLayer(tg.SpectralContinuationOptions(
-            pixel_size=pixel, slope=min(max(spectrum.slope, 2.0), 4.0),
-            octave_rms=spectrum.octave_rms, min_wavelength=4 * spacing, seed=_seeds(seed, 1)[0])))
+            pixel_size=pixel, slope=detail[0], octave_rms=detail[1],
+            min_wavelength=4 * spacing, seed=_seeds(seed, 1)[0])))
     generator = tg.TerrainGenerator(tg.RasterSource(raster), layers)
     grid = tg.RasterGrid.centered(shape[1], shape[0], spacing)
     return np.array(tg.evaluate(generator, grid=grid).values, np.float32)[::-1].copy()

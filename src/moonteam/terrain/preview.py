@@ -101,7 +101,8 @@ def _rocks(axes: Any, site: Site) -> None:
     from matplotlib.patches import Circle
 
     for boulder in site.boulders:
-        axes.add_patch(Circle((float(boulder.centre[0]), float(boulder.centre[1])), boulder.radius, facecolor="none",
+        centre = (float(boulder.centre[0]), float(boulder.centre[1]))
+        axes.add_patch(Circle(centre, boulder.radius, facecolor="none",
                               edgecolor="deepskyblue", linewidth=1.2))
 
 

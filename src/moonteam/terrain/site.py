@@ -135,7 +135,8 @@ def import_dem(
       band: of a GeoTIFF, counted from 0.
       scale: multiplies the elevations, for models not in metres.
       detrend: takes out the plane of best fit, else only the mean.
-      detail: adds relief finer than the model, continuing its power spectrum.
+      detail: adds relief finer than the model, continuing its power spectrum, where the model
+        is coarser than the site and large enough to have one.
       spacing: of the site, m.
       seed: of the added detail.
 
@@ -148,9 +149,11 @@ def import_dem(
     window -= _plane(window) if detrend else window.mean()
     sides = tuple((n - 1) * pixel for n in window.shape[::-1]) if extent_m is None else extent_m
     shape = _shape(path, sides, spacing)
-    ground = generate.refine(window, pixel, shape, spacing, seed, detail)
+    # The spectrum is the whole model's: a window has too few pixels to take one from.
+    fine = generate.spectrum(heights * scale, pixel) if detail and pixel > 2 * spacing else None
+    ground = generate.refine(window, pixel, shape, spacing, seed, fine)
     meta = {"dem": os.fspath(path), "pixel_m": pixel, "centre_m": list(centre_m), "band": band,
-            "scale": scale, "detrend": detrend, "detail": detail and pixel > 2 * spacing}
+            "scale": scale, "detrend": detrend, "detail": fine is not None}
     return Site(Path(path).stem, seed, ground, spacing, meta=meta)
 
 

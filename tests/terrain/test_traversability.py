@@ -1,0 +1,80 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from moonteam.robots import KINDS
+from moonteam.terrain.site import Boulder, Site, make_site
+from moonteam.terrain.traversability import (
+    boulder_distance,
+    limits_of,
+    passable,
+    travel_times,
+    traversability,
+)
+
+ALL = ("drone", "legged", "wheeled")
+
+
+def slope_site(degrees: float) -> Site:
+    x = np.arange(-40, 41) * 0.25
+    heights = np.tile(np.tan(np.radians(degrees)) * x, (81, 1)).astype(np.float32)
+    return Site("slope", 0, heights, 0.25)
+
+
+@pytest.mark.parametrize("kind", ["legged", "wheeled"])
+def test_slopes_close_where_the_kinds_limit_is(kind):
+    limit = np.degrees(KINDS[kind].max_slope)
+    assert traversability(slope_site(limit - 1), (12, 12), 1.0, [kind])[kind].all()
+    assert not traversability(slope_site(limit + 1), (12, 12), 1.0, [kind])[kind].any()
+
+
+def test_a_flyer_does_not_mind_slopes_nor_boulders():
+    site = replace(slope_site(35), boulders=(Boulder(np.zeros(3), 1.0, np.zeros((0, 3))),))
+    assert traversability(site, (12, 12), 1.0, ["drone"])["drone"].all()
+
+
+def test_a_boulder_closes_its_cell_and_only_near_ones():
+    rock = Boulder(np.array([2.5, -1.5, 0.0]), 0.4, np.zeros((0, 3)))
+    site = replace(make_site("flat", 0, 20.0), boulders=(rock,))
+    maps = traversability(site, (12, 12), 1.0, ALL)
+    # Cell (8, 4) of a 12 by 12 map has its centre at (2.5, -1.5).
+    assert not maps["wheeled"][4, 8]
+    assert not maps["legged"][4, 8]
+    assert maps["wheeled"].sum() > 144 - 9
+    assert maps["wheeled"][4, 10]
+    assert maps["wheeled"][0, 0]
+    assert boulder_distance(site, np.array([4.5, -1.5])) == pytest.approx(1.6, abs=1e-3)
+
+
+def test_a_ledge_is_a_step_too_high():
+    heights = np.zeros((81, 81), np.float32)
+    heights[:, 41:] = 0.3
+    site = Site("ledge", 0, heights, 0.25)
+    able = traversability(site, (16, 16), 1.0, ["wheeled"])["wheeled"]
+    assert not able[:, 7:9].any()
+    assert able[:, :6].all()
+    assert able[:, 10:].all()
+
+
+def test_steeper_is_slower_and_closed_is_for_ever():
+    times = [travel_times(slope_site(d), (4, 4), 1.0, ["wheeled"])["wheeled"].mean()
+             for d in (0, 8, 14)]
+    assert times[0] == pytest.approx(1.0 / KINDS["wheeled"].speed, rel=1e-3)
+    assert times[0] < times[1] < times[2] < 2.1 * times[0]
+    assert np.isinf(travel_times(slope_site(30), (4, 4), 1.0, ["wheeled"])["wheeled"]).all()
+
+
+def test_off_the_site_nobody_stands():
+    site = make_site("flat", 0, 8.0)
+    limits = limits_of("drone")
+    assert passable(site, np.array([[0.0, 0.0], [5.0, 0.0], [0.0, -3.9]]), limits).tolist() == [
+        True, False, False]
+
+
+@pytest.mark.parametrize(("preset", "least"), [("mare", 0.9), ("highland", 0.6), ("polar", 0.8)])
+def test_presets_are_mostly_open(preset, least):
+    maps = traversability(make_site(preset, 3, 28.0), (20, 20), 1.0, ALL)
+    assert maps["drone"].all()
+    assert maps["wheeled"].mean() > least
+    assert maps["legged"].mean() > least
