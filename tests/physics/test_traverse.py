@@ -9,6 +9,7 @@ import pytest
 from moonteam import cli
 from moonteam.errors import InputError
 from moonteam.physics import traverse
+from moonteam.physics.scene import Placement, build_scene
 from moonteam.robots import KINDS
 from moonteam.terrain.site import Boulder, Site
 
@@ -111,10 +112,23 @@ def test_command_prints_one_document_and_writes_files(capsys, tmp_path):
     assert len((tmp_path / "traverse.csv").read_text().splitlines()) == 4
 
 
+def test_film(tmp_path):
+    render = pytest.importorskip("moonteam.physics.render")
+    place, route = site(), traverse.Route((0.0, 0.0), (3.0, 0.0), 0.0)
+    scene = build_scene(place, [Placement("robot", KINDS["drone"], route.start)])
+    recording = traverse.Recording(scene, route, np.tile(scene.qpos0, (3, 1)))
+    try:
+        traverse.film(recording, tmp_path / "drone.mp4", 160, 120)
+    except render.RenderingUnavailable as error:
+        pytest.skip(str(error))
+    assert (tmp_path / "drone.mp4").stat().st_size > 1000
+
+
 def test_bad_options_give_one_line(capsys):
+    assert cli.main(["evaluate", "traverse", "--video"]) == 2
     assert cli.main(["evaluate", "traverse", "--count", "0"]) == 2
     assert cli.main(["evaluate", "traverse", "--length", "nan"]) == 2
     assert cli.main(["evaluate", "traverse", "--site", "venus", "--count", "1"]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 3
+    assert len(lines) == 4
     assert all(line.startswith("moonteam: ") for line in lines)

@@ -31,6 +31,7 @@ class Args:
     Examples:
       moonteam evaluate traverse --kind wheeled --site mare
       moonteam evaluate traverse --site highland --count 50 --out runs/traverse
+      moonteam evaluate traverse --site crater_rim --count 1 --video --out runs/rim
     """
 
     kind: tuple[Literal["drone", "legged", "wheeled"], ...] = ("drone", "legged", "wheeled")
@@ -60,6 +61,9 @@ class Args:
     out: Path | None = None
     """folder for traverse.json and traverse.csv"""
 
+    video: bool = False
+    """film the first traverse of each kind as KIND.mp4; needs --out"""
+
 
 def run(args: Args) -> int:
     """Runs the traverses; exit code 1 if any robot failed to arrive."""
@@ -67,6 +71,8 @@ def run(args: Args) -> int:
         raise InputError("--count and --sites", "must be at least 1")
     if not 1.0 <= args.length <= 200.0:
         raise InputError("--length", f"{args.length:g} m; allowed: 1 to 200")
+    if args.video and not args.out:
+        raise InputError("--video", "needs a folder to write into: --out DIR")
     from moonteam.compilation import enable_cache
 
     enable_cache()
@@ -94,7 +100,8 @@ def _run_kind(args: Args, name: str) -> tuple[list[Traverse], int]:
     """All traverses of one kind and how many routes were drawn for them."""
     import numpy as np
 
-    from moonteam.physics.traverse import draw_routes, run_traverses
+    from moonteam.physics.render import RenderingUnavailable
+    from moonteam.physics.traverse import draw_routes, film, run_traverses
     from moonteam.robots import KINDS
     from moonteam.terrain.site import make_site
 
@@ -107,7 +114,14 @@ def _run_kind(args: Args, name: str) -> tuple[list[Traverse], int]:
         routes, draws = draw_routes(KINDS[name], site, share, args.length, rng)
         total += draws
         with _watched(f"{name} on {args.site} {seed}") as watch:
-            rows += run_traverses(KINDS[name], site, routes, backend=args.backend, watch=watch)
+            found, recording = run_traverses(
+                KINDS[name], site, routes, backend=args.backend, watch=watch)
+        rows += found
+        if args.video and args.out and index == 0:
+            try:
+                film(recording, args.out / f"{name}.mp4")
+            except RenderingUnavailable as error:
+                print(f"moonteam: no video: {error}", file=sys.stderr)
     return rows, total
 
 

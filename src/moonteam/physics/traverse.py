@@ -11,14 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from moonteam.errors import InputError
+from moonteam.files import replacing
 from moonteam.physics.backends import make_backend
-from moonteam.physics.scene import Placement, build_scene, start_pose
+from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
 from moonteam.terrain.site import Site
 from moonteam.terrain.traversability import POINT_SPACING, STRAY, limits_of, passable
@@ -29,6 +31,7 @@ STUCK_PROGRESS, STUCK_SECONDS = 0.3, 20.0  # less than that far in that long
 REST_SECONDS = 3.0  # still watched after the arrival, to see where it comes to rest
 PATIENCE = 4.0  # times the time at the kind's own speed
 LOG_EVERY = 5  # control steps
+SAMPLE_SECONDS = CONTROL_PERIOD * LOG_EVERY
 MARGIN = 3.0  # m from the site's border
 BATCHES, BATCH = 20, 100  # routes drawn at most, routes judged at once
 
@@ -66,6 +69,14 @@ class Traverse:
     propellant_g: float
     tilt_p95_deg: float
     tilt_max_deg: float
+
+
+class Recording(NamedTuple):
+    """One traverse to look at."""
+
+    scene: Scene
+    route: Route
+    qpos: np.ndarray  # [T, nq], one each SAMPLE_SECONDS
 
 
 def draw_routes(
@@ -115,8 +126,8 @@ def _passable(kind: RobotKind, site: Site, start: np.ndarray, goal: np.ndarray) 
 def run_traverses(
     kind: RobotKind, site: Site, routes: Sequence[Route], *, backend: str = "native",
     threads: int = 0, watch: Callable[[float], None] = lambda seconds: None,
-) -> list[Traverse]:
-    """Runs all routes at once.
+) -> tuple[list[Traverse], Recording]:
+    """Runs all routes at once; returns a row each, and the first one's poses.
 
     Args:
       kind: which robot.
@@ -134,16 +145,19 @@ def run_traverses(
     command = (Command(jnp.asarray(goals), jnp.full(len(routes), kind.speed),
                        jnp.zeros(len(routes), bool)),)
     length = max(math.dist(r.start, r.goal) for r in routes)
-    chunk = round(1.0 / (CONTROL_PERIOD * LOG_EVERY)) * LOG_EVERY
-    judge = _Judge(kind, site, routes)
+    chunk = round(1.0 / SAMPLE_SECONDS) * LOG_EVERY
+    judge, poses = _Judge(kind, site, routes), []
     for _ in range(math.ceil(PATIENCE * length / kind.speed)):
         state, log = engine.advance(state, command, chunk)
         judge.add(np.asarray(log.qpos), np.asarray(log.power), np.asarray(log.propellant_rate),
                   np.asarray(state.diverged))
+        poses.append(np.asarray(log.qpos[0]))
         watch(judge.seconds)
         if judge.done:
             break
-    return judge.verdicts()
+    rows = judge.verdicts()
+    until = round((rows[0].seconds + REST_SECONDS) / SAMPLE_SECONDS)
+    return rows, Recording(scene, routes[0], np.concatenate(poses)[:until])
 
 
 class _Judge:
@@ -153,7 +167,6 @@ class _Judge:
         self._kind, self._site, self._routes = kind, site, routes
         self._start = np.array([r.start for r in routes])  # [B, 2] m
         self._goal = np.array([r.goal for r in routes])
-        self._period = CONTROL_PERIOD * LOG_EVERY
         self._ends: list[tuple[Outcome, int] | None] = [None] * len(routes)
         self._xy: list[np.ndarray] = []
         self._tilt: list[np.ndarray] = []
@@ -163,13 +176,13 @@ class _Judge:
     @property
     def seconds(self) -> float:
         """Simulated so far."""
-        return sum(part.shape[1] for part in self._xy) * self._period
+        return sum(part.shape[1] for part in self._xy) * SAMPLE_SECONDS
 
     @property
     def done(self) -> bool:
         """Whether every traverse has ended, and those that arrived had time to rest."""
-        now = round(self.seconds / self._period)
-        rest = round(REST_SECONDS / self._period)
+        now = round(self.seconds / SAMPLE_SECONDS)
+        rest = round(REST_SECONDS / SAMPLE_SECONDS)
         return all(end is not None and (end[0] != "arrived" or end[1] + rest <= now)
                    for end in self._ends)
 
@@ -194,10 +207,10 @@ class _Judge:
         near = np.flatnonzero(np.linalg.norm(xy - goal, axis=1) < ARRIVAL)
         if near.size:
             return "arrived", int(near[0]) + 1
-        fallen = round(FALLEN_SECONDS / self._period)
+        fallen = round(FALLEN_SECONDS / SAMPLE_SECONDS)
         if len(tilt) >= fallen and (tilt[-fallen:] > FALLEN_TILT).all():
             return "fallen", len(xy)
-        stuck = round(STUCK_SECONDS / self._period)
+        stuck = round(STUCK_SECONDS / SAMPLE_SECONDS)
         if len(xy) > stuck and np.linalg.norm(xy[-1] - xy[-1 - stuck]) < STUCK_PROGRESS:
             return "stuck", len(xy)
         return None
@@ -216,8 +229,8 @@ class _Judge:
         line = line / np.linalg.norm(line)
         away = xy[:end] - self._start[b]
         cross = np.abs(line[0] * away[:, 1] - line[1] * away[:, 0])
-        progress, seconds = float(away[-1] @ line), end * self._period
-        rest = xy[min(len(xy), end + round(REST_SECONDS / self._period)) - 1] - self._goal[b]
+        progress, seconds = float(away[-1] @ line), end * SAMPLE_SECONDS
+        rest = xy[min(len(xy), end + round(REST_SECONDS / SAMPLE_SECONDS)) - 1] - self._goal[b]
         route = self._routes[b]
         return Traverse(
             self._kind.name, self._site.name, self._site.seed, route.start, route.goal,
@@ -226,9 +239,34 @@ class _Judge:
             cross_track_p95_m=float(np.percentile(cross, 95)),
             cross_track_max_m=float(cross.max()),
             rest_error_m=float(np.linalg.norm(rest)) if outcome == "arrived" else math.nan,
-            energy_j_per_m=float(power[:end].sum() * self._period / max(progress, 0.1)),
-            propellant_g=float(propellant[:end].sum() * self._period * 1000.0),
+            energy_j_per_m=float(power[:end].sum() * SAMPLE_SECONDS / max(progress, 0.1)),
+            propellant_g=float(propellant[:end].sum() * SAMPLE_SECONDS * 1000.0),
             tilt_p95_deg=float(np.percentile(tilt[:end], 95)), tilt_max_deg=float(tilt[:end].max()))
+
+
+def film(recording: Recording, path: Path, width: int = 640, height: int = 480) -> None:
+    """Writes an MP4: a camera flies along, a post marks the goal, a line the way.
+
+    A slow robot is shown up to four times faster, at 25 frames a second.
+    Raises RenderingUnavailable without off-screen OpenGL.
+    """
+    import imageio_ffmpeg
+    import mediapy
+
+    from moonteam.physics import render
+
+    scene, route, qpos = recording
+    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    share = np.linspace(0.0, 1.0, 41)[:, None]
+    line = np.array(route.start) + share * (np.array(route.goal) - np.array(route.start))
+    markers = render.path(render.on_ground(scene, line, 0.03), (0.9, 0.7, 0.1, 1.0))
+    markers += render.post(scene, np.array(route.goal), (0.1, 0.8, 0.3, 1.0))
+    faster = min(4, max(1, round(len(qpos) * SAMPLE_SECONDS / 15.0)))
+    with (replacing(path) as temporary, render.Renderer(scene, width, height) as renderer,
+          mediapy.VideoWriter(temporary, (height, width), fps=1.0 / SAMPLE_SECONDS) as writer):
+        for pose in qpos[::faster]:
+            camera = render.follow(pose[:3], distance=3.0, azimuth=120.0, elevation=-22.0)
+            writer.add_image(renderer.frame(pose, camera, markers))
 
 
 def summarise(rows: Sequence[Traverse]) -> dict[str, Any]:
