@@ -48,7 +48,7 @@ def test_weighted_lies_between_the_two_objectives(golden):
 @pytest.mark.parametrize("blocked", [None, GROUND])
 @pytest.mark.parametrize(("alpha", "beta"), [(1, 0), (0, 1), (2, 1)])
 def test_agrees_with_a_joint_state_search(joint_state_search, alpha, beta, blocked):
-    for seed in range(12):
+    for seed in range(10):
         found = grid.generate(seed, num_agents=2, num_targets=3 + seed % 2,
                               num_skills=2 + seed % 2, size=(5, 5), blocked=blocked)
         snapshot = Snapshot.start(found)
@@ -62,12 +62,12 @@ def test_agrees_with_a_joint_state_search(joint_state_search, alpha, beta, block
 def test_three_agents_that_must_meet_agree_with_the_joint_state_search(joint_state_search, alpha,
                                                                        beta):
     rng = np.random.default_rng(5)
-    for _ in range(4):
+    for _ in range(2):
         cells = [(int(c) % 3, int(c) // 3) for c in rng.permutation(9)]
         found = scenario(
             [(cells[0], ("A",)), (cells[1], ("B",)), (cells[2], ("C",))],
             [(cells[3], ("A", "B", "C"), "AND"), (cells[4], ("A", "C"), "AND"),
-             (cells[5], ("B", "C"), "AND"), (cells[6], ("A", "B"), "AND")], size=(3, 3))
+             (cells[5], ("B", "C"), "AND")], size=(3, 3))
         snapshot = Snapshot.start(found)
         plan = ExactPlanner("weighted", alpha=alpha, beta=beta).plan(snapshot)
         value = alpha * plan.makespan + beta * plan.moves
@@ -186,7 +186,7 @@ def test_too_few_steps_left_is_infeasible_to_the_step():
 
 
 def test_fewest_moves_within_the_steps_left():
-    """One agent alone needs 12 moves and 12 steps; with 10 steps two must share the work."""
+    """One agent alone takes 10 steps and 10 moves; within 9 steps two must share the work."""
     found = scenario([((4, 0), ("A",)), ((5, 7), ("A",))],
                      [((0, 0), ("A",), "OR"), ((7, 0), ("A",), "OR")], max_steps=12)
     easy = ExactPlanner("moves").plan(Snapshot.start(found))
