@@ -58,7 +58,8 @@ def hillshade(heights: npt.NDArray, spacing: float) -> npt.NDArray[np.uint8]:
     up = 1.0 / np.sqrt(1.0 + east**2 + north**2)
     shade = (-east * light[0] - north * light[1] + light[2]) * up
     relief = (heights - heights.min()) / max(float(np.ptp(heights)), 1e-6)
-    return np.clip(38 + 95 * shade + 30 * (relief - 0.5), 15, 200).astype(np.uint8)
+    contrast = (shade - light[2]) / max(float(shade.std()), 0.05)  # level ground: none
+    return np.clip(100 + 22 * contrast + 30 * (relief - 0.5), 15, 200).astype(np.uint8)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,10 @@ import json
 import pytest
 
 from moonteam.cli import main
+from moonteam.physics import backends, render
+from moonteam.physics.backends import NativeBackend
+from moonteam.physics.render import RenderingUnavailable
+from sim2grid import film
 
 GOOD = """
 map: {size: [3, 3], cell_m: 1.0}
@@ -19,7 +23,7 @@ targets:
 
 def rollout(mission, out, *options):
     return main(["rollout", str(mission), "--out", str(out), "--planner", "exact",
-                 "--backend", "native", "--no-video", *options])
+                 "--backend", "native", *(options or ("--no-video",))])
 
 
 @pytest.mark.parametrize(("old", "new", "named"), [
@@ -87,7 +91,7 @@ def test_real_robots_solve_a_tiny_mission_and_the_same_seed_gives_the_same_repor
         tmp_path, capsys):
     file = tmp_path / "tiny.yaml"
     file.write_text(GOOD)
-    assert rollout(file, tmp_path / "one", "--json") == 0
+    assert rollout(file, tmp_path / "one", "--no-video", "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["success"]
     assert report["mission"] == "tiny"
@@ -109,10 +113,43 @@ def test_real_robots_solve_a_tiny_mission_and_the_same_seed_gives_the_same_repor
     assert "solved at decision" in capsys.readouterr().out
 
 
-def test_a_failed_mission_exits_with_one_and_still_reports(tmp_path, capsys):
-    file = tmp_path / "hasty.yaml"
+def test_a_failed_mission_exits_with_one_and_without_opengl_shows_the_map(
+        tmp_path, capsys, monkeypatch):
+    def nothing(width, height):
+        raise RenderingUnavailable("no display")
+
+    monkeypatch.setattr(render, "_open_window", nothing)
+    monkeypatch.setattr(film, "playback", lambda seconds: 10.0)
+    monkeypatch.setattr(film, "SHORTEST_S", 0.0)
+    monkeypatch.setattr(film, "HOLD_S", 0.2)
+    file, out = tmp_path / "hasty.yaml", tmp_path / "out"
     file.write_text("max_steps: 1\n" + GOOD.replace("start: [1, 0]", "start: [2, 2]"))
-    assert rollout(file, tmp_path / "out") == 1
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert rollout(file, out, "--seed", "0") == 1
+    report = json.loads((out / "report.json").read_text())
     assert (report["success"], report["cause"], report["decisions"]) == (False, "max_steps", 1)
-    assert "FAILED" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert "FAILED" in captured.out
+    assert "install" in captured.err
+    assert (out / "map.mp4").stat().st_size > 1000
+    assert not (out / "video.mp4").exists()
+
+
+def test_an_interrupted_rollout_saves_what_is_done(tmp_path, capsys, monkeypatch):
+    class Stopped(NativeBackend):
+        calls = 0
+
+        def advance(self, state, commands, num_control_steps):
+            Stopped.calls += 1
+            if Stopped.calls == 3:
+                raise KeyboardInterrupt
+            return super().advance(state, commands, num_control_steps)
+
+    monkeypatch.setattr(backends, "NativeBackend", Stopped)
+    file, out = tmp_path / "tiny.yaml", tmp_path / "out"
+    file.write_text(GOOD)
+    assert rollout(file, out) == 130
+    report = json.loads((out / "report.json").read_text())
+    assert (report["success"], report["cause"]) == (False, "interrupted")
+    assert report["seconds"] == pytest.approx(0.4)
+    assert (out / "paths.png").stat().st_size > 1000
+    assert "report.json" in capsys.readouterr().err
