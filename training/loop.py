@@ -85,6 +85,7 @@ class Run:
     def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0):
         """Raises InputError if the folder holds a run that this one may not go on with."""
         self.config, self.out, self.checkpoint_seconds = config, out, checkpoint_seconds
+        self.commit = commit()  # of the code that is loaded now, whatever is checked out later
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
         self.folder = out / "checkpoints"
         self.position, arrays = self._find(resume)
@@ -222,7 +223,7 @@ class Run:
         report = {
             "preset": self.config.name, "seed": self.config.seed,
             "env_steps": self.position.env_steps, "seconds": self.position.seconds,
-            "device": describe_device(), "commit": commit(),
+            "device": describe_device(), "commit": self.commit,
             "scenarios": FINAL_SCENARIOS, **self.evaluate(phase, FINAL_SCENARIOS)}
         self.write_policy(self.out / "policy.safetensors")
         record.draw_curve(self.out / "curve.png", {f"seed {self.config.seed}": self.metrics.rows})
@@ -235,7 +236,7 @@ class Run:
         params = jax.device_get(self.learner.params._asdict())
         recipe = dataclasses.asdict(self.config) | {"env_steps": self.position.env_steps}
         save_policy(path, PolicyFile("recurrent", dataclasses.asdict(self.config.spec), params,
-                                     recipe, commit()))
+                                     recipe, self.commit))
 
 
 def _summary(report: Report) -> dict[str, float]:
