@@ -154,7 +154,7 @@ class MapPicture:
         reach = max(self.pixel * 0.46, 5.0 * SMOOTH)
         width = max(2, round(reach * 0.2))
         pen.rectangle([x - reach, y - reach, x + reach, y + reach], outline=color, width=width)
-        size = round(max(self.pixel * 0.26, 9 * SMOOTH))
+        size = round(max(self.pixel * 0.26, (12 if labels else 9) * SMOOTH))
         need = requirement(mark.target)
         inside = self.pixel * 0.9 > pen.textlength(need, font(size, True))
         if inside:
@@ -178,10 +178,10 @@ class MapPicture:
         draw_robot(pen, robot.kind, (float(x), float(y)),
                    max(self.pixel * 0.24, 4.5 * SMOOTH), color)
         if labels:
-            size = round(max(self.pixel * 0.22, 8 * SMOOTH))
-            above = y - self.pixel * 0.3 - size * 1.3 > 0
-            _text(pen, (self._fit(pen, x, robot.name, size),
-                        y - self.pixel * 0.3 if above else y + self.pixel * 0.3),
+            size = round(max(self.pixel * 0.22, 12 * SMOOTH))
+            away = max(self.pixel * 0.3, 8 * SMOOTH)
+            above = y - away - size * 1.3 > 0
+            _text(pen, (self._fit(pen, x, robot.name, size), y - away if above else y + away),
                   robot.name, color, size, "md" if above else "ma")
 
 

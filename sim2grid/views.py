@@ -145,7 +145,7 @@ class SceneViews:
         if self.prepared.bodies[robot].flies:
             base = self.prepared.bodies[robot].base
             points[:, 2] = self.film.qpos[keep, base + 2]
-        return self.film.times[keep], path(points, _rgba(robot_color(robot), 0.8), 0.025)
+        return self.film.times[keep], path(points, _rgba(robot_color(robot), 0.8), 0.03)
 
 
 def _rgba(color: Color, alpha: float = 1.0) -> Rgba:

@@ -2,13 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from moonteam.cli import main
 from moonteam.physics import backends, render
 from moonteam.physics.backends import NativeBackend
 from moonteam.physics.render import RenderingUnavailable
-from sim2grid import film
+from sim2grid import film, prepare
 
 GOOD = """
 map: {size: [3, 3], cell_m: 1.0}
@@ -85,6 +86,25 @@ def test_out_that_is_a_file_is_refused(tmp_path, capsys):
     assert rollout(file, file) == 2
     assert "is a file" in capsys.readouterr().err
     assert file.read_text() == GOOD
+
+
+@pytest.mark.parametrize(("kind", "cell", "named"), [
+    ("wheeled", (1, 0), "robots[1].start"), ("drone", (1, 1), "targets[0].at")])
+def test_ground_that_bars_a_start_or_a_target_is_refused(
+        tmp_path, capsys, monkeypatch, kind, cell, named):
+    def barred(site, mission, kinds):
+        maps = {k: np.ones((3, 3), bool) for k in kinds}
+        maps[kind][cell[1], cell[0]] = False
+        return maps
+
+    monkeypatch.setattr(prepare, "passable_cells", barred)
+    file, out = tmp_path / "steep.yaml", tmp_path / "out"
+    file.write_text(GOOD)
+    assert rollout(file, out) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert named in message
+    assert not out.exists()
 
 
 def test_real_robots_solve_a_tiny_mission_and_the_same_seed_gives_the_same_report(
