@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,11 +201,22 @@ def _verdict(plan: Plan, alpha: float, beta: float) -> str:
     return f"feasible: proved that no plan has less than {plan.bound:g} of {goal}"
 
 
+def _busy() -> contextlib.AbstractContextManager[object]:
+    """A sign of life on a terminal: the searches are compiled when first used on a machine."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        return contextlib.nullcontext()
+    return console.status("planning; the first time on a machine it compiles for a minute")
+
+
 def run(args: Args) -> int:
     """Plans, prints, and draws; 1 if there is no plan."""
     check(args)
     case = load_case(args.scenario)
-    plan = make_plan(args, Snapshot.start(case.scenario))
+    with _busy():
+        plan = make_plan(args, Snapshot.start(case.scenario))
     if args.json:
         print(files.dump_json(plan.document()))
     else:

@@ -3,6 +3,9 @@
 Legend: B states, N agents, M targets, K kinds, H rows, W columns. Arrays are padded as in
 `moonteam.grid.types`: agents with `agent_mask` False and targets that are `solved` are left
 out, so padding costs nothing.
+
+Numba's cache of this file looks at this file's own date alone, and holds what it inlined from
+`search` and `travel`: after a change in those, save this file again or empty `__pycache__`.
 """
 
 from __future__ import annotations
