@@ -23,7 +23,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from moonteam.compilation import enable_cache
-from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
+from moonteam.physics.scene import FRICTION, Placement, Scene, build_scene, start_pose
 from moonteam.robots.base import CONTROL_PERIOD, PHYSICS_DT, Command
 from moonteam.robots.legged import GAIT, LEGGED, Gait, LeggedState, control_with
 from moonteam.terrain.site import SPACING, Site, make_site
@@ -42,7 +42,8 @@ SPANS: dict[str, tuple[float, float]] = {
     "length": (0.17, 0.24), "clearance": (0.03, 0.10), "catch": (0.0, 0.25),
     "lean": (-0.2, 0.3), "follow": (0.5, 1.0), "velocity": (3.0, 20.0), "push": (0.4, 1.2),
     "lift": (30.0, 200.0), "lift_damping": (5.0, 30.0),
-    "attitude": (60.0, 400.0), "attitude_damping": (8.0, 40.0), "swing": (20.0, 60.0), "moment": (0.005, 1.0), "friction": (0.4, 0.75),
+    "attitude": (60.0, 400.0), "attitude_damping": (8.0, 40.0),
+    "swing": (20.0, 60.0), "moment": (0.005, 1.0), "friction": (0.4, 0.75),
 }  # fmt: skip
 """What the search may change, and within which limits."""
 
@@ -261,7 +262,9 @@ def _free(site: Site, start: np.ndarray, goal: np.ndarray) -> bool:
     return True
 
 
-def evaluate(ground: str, seeds: range, per_site: int, threads: int) -> dict[str, object]:
+def evaluate(
+    ground: str, seeds: range, per_site: int, friction: float, threads: int
+) -> dict[str, object]:
     """Random 20 m traverses of a preset, or of 4 cm rms roughness; what a report wants."""
     parts: list[Walks] = []
     for seed in seeds:
@@ -276,7 +279,7 @@ def evaluate(ground: str, seeds: range, per_site: int, threads: int) -> dict[str
             Placement("r", LEGGED, (e[0], e[1]), math.atan2(e[3] - e[1], e[2] - e[0]))
             for e in ends
         ]
-        scene = build_scene(site, placements[:1])
+        scene = build_scene(site, placements[:1], friction=friction)
         starts = np.array([start_pose(site, p) for p in placements])
         parts.append(walk(scene, starts, ends[:, 2:], 120.0, threads=threads))
     walks = Walks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
@@ -318,6 +321,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--grounds", nargs="+", default=["course", "rough", "mare", "highland"])
     parser.add_argument("--sites", type=int, default=5, help="sites of each ground")
     parser.add_argument("--walks", type=int, default=10, help="walks on each site")
+    parser.add_argument("--friction", type=float, default=FRICTION, help="of the ground")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(arguments)
     enable_cache()
@@ -328,18 +332,18 @@ def main(arguments: list[str] | None = None) -> None:
         rows = []
         for ground in args.grounds:
             if ground == "course":
-                rows.extend(course_rows(seeds))
+                rows.extend(course_rows(seeds, args.friction))
             else:
-                rows.append(evaluate(ground, seeds, args.walks, args.threads))
+                rows.append(evaluate(ground, seeds, args.walks, args.friction, args.threads))
         print(json.dumps(rows, indent=1))
 
 
-def course_rows(seeds: range) -> list[dict[str, object]]:
+def course_rows(seeds: range, friction: float) -> list[dict[str, object]]:
     """Figures lane by lane."""
     parts: list[Walks] = []
     for seed in seeds:
         site = course(seed)
-        scene = build_scene(site, [Placement("r", LEGGED, (-4.5, 0.0))])
+        scene = build_scene(site, [Placement("r", LEGGED, (-4.5, 0.0))], friction=friction)
         parts.append(walk(scene, *lanes(site), 60.0))
     by_lane = Walks(*(np.stack(columns, axis=1) for columns in zip(*parts, strict=True)))
     return [
