@@ -11,6 +11,7 @@ from moonteam.evaluation import replanning, rollouts
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Options, Planned, contenders
 from moonteam.evaluation.decode import parse
+from moonteam.evaluation.draw import Draw
 from moonteam.grid import env
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.scenarios import generate, to_problem
@@ -57,7 +58,7 @@ def test_what_comes_after_the_end_does_not_count(golden):
 
 
 def replanned(count=2, seed=0):
-    return worlds.build(replanning.draw(count, seed, 10), num_buffer=5)
+    return worlds.build(Draw(count, seed, num_targets=10).scenarios("r"), num_buffer=5)
 
 
 def test_exact_replanning_solves_all_ten_and_one_environment_agrees():
@@ -94,9 +95,9 @@ def test_exact_replanning_solves_all_ten_and_one_environment_agrees():
 
 
 def test_every_planner_meets_the_same_new_targets():
-    one, other = replanning.draw(3, 7, 10), replanning.draw(5, 7, 10)
+    one, other = (Draw(count, 7, num_targets=10).scenarios("r") for count in (3, 5))
     assert one == other[:3]
-    assert replanning.draw(3, 8, 10) != one
+    assert Draw(3, 8, num_targets=10).scenarios("r") != one
 
 
 def test_a_target_solved_at_the_start_is_refused():

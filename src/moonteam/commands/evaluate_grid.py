@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -26,14 +27,16 @@ class Args:
     may be given several times.
 
     Examples:
-      moonteam evaluate grid 3r5t --planner exact --planner greedy --limit 200
+      moonteam evaluate grid 3x5 --planner exact --planner greedy --limit 200
       moonteam evaluate grid set.jsonl --planner exact --objective makespan --objective moves
-      moonteam evaluate grid small --planner policy --policy small --decode argmax
-      --decode best-of-16 --out runs/small
+      moonteam evaluate grid 3x7 --planner lns --time-limit 0.1 --out runs/lns
+      moonteam evaluate grid --count 500 --targets 3 --side 8 --max-steps 48 --planner policy
+      --policy small --decode argmax --decode best-of-16
     """
 
-    set: tyro.conf.Positional[str]
-    """Scenario set (.jsonl), scenario (.json), or the name of a bundled set."""
+    set: tyro.conf.Positional[str | None] = None
+    """Scenario set (.jsonl), scenario (.json), or the name of a bundled set; without it,
+    --count scenarios are drawn from --seed."""
     planner: Many[tuple[str, ...]] = ()
     """exact, greedy, lns, exhaustive, cpsat or policy; again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
@@ -54,9 +57,19 @@ class Args:
     time_limit: float | None = None
     """Seconds a scenario that anytime planners may take; theirs by default."""
     seed: int = 0
-    """Seed of sampling and of the bootstrap."""
+    """Seed of the scenarios drawn, of sampling and of the bootstrap."""
     limit: int | None = None
     """Only the first so many scenarios of the set."""
+    count: int = 200
+    """Without SET: scenarios to draw."""
+    agents: int = 3
+    """Without SET: agents of each scenario drawn."""
+    targets: int = 5
+    """Without SET: targets of each scenario drawn."""
+    side: int = 32
+    """Without SET: cells of a side of the map."""
+    max_steps: int = 128
+    """Without SET: steps in which a scenario must be solved."""
     json: bool = False
     """Print the report as one JSON document and nothing else."""
     markdown: bool = False
@@ -83,13 +96,33 @@ def load_set(name: str, limit: int | None) -> list[Scenario]:
     return found[:limit]
 
 
+def drawn(args: Any) -> dict[str, object]:
+    """The options of a draw that the command line must repeat; `args` has them as fields."""
+    names = ("count", "agents", "targets", "side", "max_steps")
+    return {name.replace("_", "-"): getattr(args, name) for name in names
+            if name == "count" or getattr(args, name) != args.__dataclass_fields__[name].default}
+
+
+def _scenarios(args: Args) -> tuple[list[Scenario], str]:
+    """The scenarios and a title."""
+    if args.set is not None:
+        found = load_set(args.set, args.limit)
+        return found, f"{Path(args.set).stem}: {len(found)} scenarios"
+    from moonteam.evaluation.draw import Draw
+
+    found = Draw(args.count, args.seed, args.agents, args.targets, args.side,
+                 args.max_steps).scenarios("drawn")[:args.limit]
+    return found, (f"{args.agents} agents, {args.targets} targets on {args.side}x{args.side}: "
+                   f"{len(found)} scenarios")
+
+
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the planners achieved."""
     compilation.enable_cache()
     from moonteam.evaluation import figures, grid, report
     from moonteam.evaluation.contenders import Options, contenders
 
-    found = load_set(args.set, args.limit)
+    found, title = _scenarios(args)
     options = Options(
         planners=args.planner or ("exact",), objectives=args.objective or ("makespan",),
         policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
@@ -97,12 +130,12 @@ def run(args: Args) -> int:
         temperature=args.temperature, alpha=args.alpha, beta=args.beta,
         time_limit=args.time_limit, seed=args.seed)
     rows = contenders(options)
-    command = command_line("evaluate grid", [args.set], {
+    command = command_line("evaluate grid", [args.set] if args.set else [], {
+        **({} if args.set else drawn(args)),
         "planner": options.planners, "objective": args.objective, "policy": args.policy,
         "preference": args.preference, "decode": args.decode,
         "temperature": args.temperature if args.temperature != 1.0 else None,
         "time-limit": args.time_limit, "seed": args.seed or None, "limit": args.limit})
-    title = f"{Path(args.set).stem}: {len(found)} scenarios"
     document = grid.evaluate(found, rows, args.seed, title, command)
     if args.out:
         report.save(args.out, document, grid.PAGE)

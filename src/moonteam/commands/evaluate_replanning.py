@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from moonteam import compilation, files, paths
-from moonteam.commands.evaluate_grid import Many, command_line, load_set
+from moonteam.commands.evaluate_grid import Many, command_line, drawn, load_set
 from moonteam.errors import InputError
 from moonteam.scenario import Scenario
 
@@ -46,7 +46,15 @@ class Args:
     new: int = 5
     """How many of a scenario's targets appear later."""
     count: int = 200
-    """Scenarios to draw where no SET is given, each with 5 targets and --new more."""
+    """Without SET: scenarios to draw."""
+    agents: int = 3
+    """Without SET: agents of each scenario drawn."""
+    targets: int = 5
+    """Without SET: targets of each scenario drawn, --new more appear later."""
+    side: int = 32
+    """Without SET: cells of a side of the map."""
+    max_steps: int = 128
+    """Without SET: steps in which a scenario must be solved."""
     seed: int = 0
     """Seed of the scenarios drawn, of sampling and of the bootstrap."""
     time_limit: float | None = None
@@ -63,15 +71,17 @@ class Args:
 
 def _scenarios(args: Args) -> tuple[list[Scenario], str]:
     """The scenarios and a title."""
-    from moonteam.evaluation import replanning
+    from moonteam.evaluation.draw import Draw
 
     if args.new < 1:
         raise InputError("--new", f"{args.new} is not allowed; at least 1")
     if args.set is not None:
         found = load_set(args.set, args.limit)
         return found, f"{Path(args.set).stem}, replanning: {len(found)} scenarios"
-    found = replanning.draw(args.count, args.seed, 5 + args.new)[:args.limit]
-    return found, f"replanning 5 + {args.new}: {len(found)} scenarios"
+    found = Draw(args.count, args.seed, args.agents, args.targets + args.new, args.side,
+                 args.max_steps).scenarios("replanning")[:args.limit]
+    return found, (f"replanning {args.targets} + {args.new}, {args.agents} agents on "
+                   f"{args.side}x{args.side}: {len(found)} scenarios")
 
 
 def run(args: Args) -> int:
@@ -95,7 +105,7 @@ def run(args: Args) -> int:
         "preference": args.preference, "decode": args.decode,
         "temperature": args.temperature if args.temperature != 1.0 else None,
         "new": args.new if args.new != 5 else None,
-        "count": None if args.set else args.count, "seed": args.seed or None,
+        **({} if args.set else drawn(args)), "seed": args.seed or None,
         "time-limit": args.time_limit, "limit": args.limit})
     document = replanning.evaluate(found, rows, args.new, args.seed, title, command)
     if args.out:

@@ -23,7 +23,6 @@ from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Contender, Options, contenders
 from moonteam.evaluation.metrics import Outcomes, Reference
 from moonteam.evaluation.progress import track
-from moonteam.grid.scenarios import generate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
 from moonteam.scenario import Scenario
@@ -34,16 +33,6 @@ PAGE = tuple(column for column in COLUMNS if column.key != "decisions")
 PANELS = (("makespan_gap", "T over exact(makespan), %", 100.0),
           ("moves_gap", "moves over exact(moves), %", 100.0),
           ("success", "success", 1.0))
-
-
-def draw(count: int, seed: int, num_targets: int, num_agents: int = 3,
-         size: tuple[int, int] = (32, 32), max_steps: int = 128) -> list[Scenario]:
-    """`count` scenarios of `num_targets` targets, those to come included."""
-    if count < 1:
-        raise InputError("--count", f"{count} is not allowed; at least 1")
-    return [generate(np.random.default_rng([seed, i]), num_agents=num_agents,
-                     num_targets=num_targets, size=size, max_steps=max_steps,
-                     name=f"replanning-{seed}-{i:04d}") for i in range(count)]
 
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], num_new: int, seed: int,
