@@ -77,7 +77,8 @@ def run(args: Args) -> int:
     site = _site(args)
     report = measure(site) | {"traversable": _open_shares(site, args.cell)}
     if args.out is not None:
-        report["files"] = _write(site, args, report)
+        report["files"] = _write(site, args.out, args.cell)
+        files.write_json(args.out / "site.json", report)
     if args.json:
         print(files.dump_json(report))
     else:
@@ -104,22 +105,21 @@ def _open_shares(site: Any, cell_m: float) -> dict[str, float]:
     return {kind: round(float(cells.mean()), 4) for kind, cells in maps.items()}
 
 
-def _write(site: Any, args: Args, report: dict[str, Any]) -> list[str]:
+def _write(site: Any, out: Path, cell_m: float) -> list[str]:
+    """Writes elevations and pictures; the names of all files, site.json included."""
     import numpy as np
 
     from moonteam.terrain.generate import write_dem
     from moonteam.terrain.preview import draw_all
 
-    out = args.out or Path()
     with files.replacing(out / "heights.npy") as temporary:
         # North first, so that the file can be imported again.
         np.save(temporary, site.heights[::-1])
     with files.replacing(out / "heights.tif") as temporary:
         write_dem(temporary, site.heights, site.spacing)
-    pictures = draw_all(site, out, args.cell)
-    files.write_json(out / "site.json", report)
-    return [str(out / name) for name in ("heights.npy", "heights.tif", "site.json")] + [
-        str(path) for path in pictures]
+    pictures = draw_all(site, out, cell_m)
+    names = [out / "heights.npy", out / "heights.tif", out / "site.json", *pictures]
+    return [str(name) for name in names]
 
 
 def _show(report: dict[str, Any]) -> None:

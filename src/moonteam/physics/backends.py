@@ -255,7 +255,7 @@ class NativeBackend:
         self._batch: Batch | None = None
         self._reset = jax.jit(jax.vmap(
             lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
-        self._control = jax.jit(jax.vmap(self._control_world, in_axes=(None, 0, 0, 0, 0, 0)))
+        self.controllers = jax.vmap(self._control_world, in_axes=(None, 0, 0, 0, 0, 0))
         self._programs: dict[int, jax.stages.Compiled] = {}
 
     def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
@@ -291,7 +291,7 @@ class NativeBackend:
         _check_steps(num_control_steps, self.log_every)
         state = self.reset(batch=batch)
         begun = time.perf_counter()
-        self._programs[batch] = self._control.lower(
+        self._programs[batch] = jax.jit(self.controllers).lower(
             self.scene.surface, state.time, state.qpos, state.qvel, state.control,
             hold(self.scene, batch)).compile()
         return time.perf_counter() - begun
