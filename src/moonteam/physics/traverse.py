@@ -286,7 +286,7 @@ def summarise(rows: Sequence[Traverse]) -> dict[str, Any]:
                 "cross_track_rms_m", "cross_track_p95_m", "tilt_p95_deg"):
         values = np.array([r[key] for r in arrived])
         power = 2 if key == "cross_track_rms_m" else 1
-        summary[key], summary[key.rsplit("_", 1)[0] + "_interval"] = _mean(values, power)
+        summary[key], summary[key + "_interval"] = _mean(values, power)
     summary["cross_track_max_m"] = max((r["cross_track_max_m"] for r in arrived), default=None)
     summary["tilt_max_deg"] = max((r["tilt_max_deg"] for r in arrived), default=None)
     return summary
