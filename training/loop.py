@@ -97,8 +97,8 @@ class Run:
     def _find(self, resume: bool) -> tuple[Position, dict[str, np.ndarray] | None]:
         stored = self.out / "config.json"
         plain = msgspec.json.decode(files.dump_json(self.config))
-        found = None
-        if stored.exists() and not resume:
+        held = stored.exists() or checkpoints.newest(self.folder) is not None
+        if held and not resume:
             raise InputError(self.out, "already holds a run; --resume goes on with it, or choose "
                              "another --out")
         if stored.exists():
@@ -108,13 +108,14 @@ class Run:
                 raise InputError(stored, "was started with other numbers; a resumed run must keep "
                                  f"them ({before.get(odd[0])!r}, now {plain.get(odd[0])!r})",
                                  odd[0])
-            found = checkpoints.load(self.folder)
-        files.write_json(stored, plain)
+        found = checkpoints.load(self.folder)
         if found is None:
+            files.write_json(stored, plain)
             return Position(self.config.phases[0][0]), None
         about, arrays = found
         if about.network != dataclasses.asdict(self.config.spec) | {"size": list(self.config.size)}:
             raise InputError(self.folder, "holds checkpoints of another network")
+        files.write_json(stored, plain)
         return Position(about.phase, about.update, about.total_updates, about.env_steps,
                         about.seconds), arrays
 
@@ -149,12 +150,11 @@ class Run:
         progress = record.Progress(self.config, self.position.env_steps)
         try:
             first = self.phase_names.index(self.position.phase)
-            for index in range(first, len(self.config.phases)):
-                if not self._train_phase(index, stop, stop_after, progress):
-                    self.save()
-                    return False
+            with networks.matmul_precision(self.config.precision):
+                phases = range(first, len(self.config.phases))
+                done = all(self._train_phase(i, stop, stop_after, progress) for i in phases)
             self.save()
-            return True
+            return done
         finally:
             progress.stop()
 
