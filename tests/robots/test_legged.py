@@ -32,17 +32,21 @@ def alone():
     return model, mujoco.MjData(model)
 
 
-def drive(scene: Scene, orders, seconds, yaw=0.0, kick=(0.0, 0.0)):
-    """Runs one robot, started at `kick` m/s; its data, bases [T, 3], largest torque asked."""
+def drive(scene: Scene, orders, seconds, yaw=0.0, kick=(0.0, 0.0), limp=0.0):
+    """Runs one robot, started at `kick` m/s and without power for the first `limp` seconds.
+
+    Returns its data, bases [T, 3] and the largest torque asked.
+    """
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = start_pose(scene.site, Placement("r", LEGGED, (0.0, 0.0), yaw))
     data.qvel[:2] = kick
     mujoco.mj_forward(model, data)
     state = LEGGED.init(jnp.asarray(data.qpos, jnp.float32), jnp.zeros(18))
     bases, most = [], 0.0
-    for _ in range(round(seconds / CONTROL_PERIOD)):
+    for step in range(round(seconds / CONTROL_PERIOD)):
+        now = orders._replace(lost=jnp.array(step * CONTROL_PERIOD < limp) | orders.lost)
         seen = (data.qpos.astype(np.float32), data.qvel.astype(np.float32))
-        ctrl, state, _ = CONTROL(state, jnp.float32(0), *seen, orders, scene.surface)
+        ctrl, state, _ = CONTROL(state, jnp.float32(0), *seen, now, scene.surface)
         data.ctrl[:] = ctrl
         most = max(most, float(np.abs(ctrl).max()))
         mujoco.mj_step(model, data, tune_legged.SUBSTEPS)
@@ -101,10 +105,10 @@ def test_only_feet_and_inner_spheres_touch(alone):
     model, _ = alone
     touching = {model.geom(g).name for g in range(model.ngeom)
                 if model.geom_conaffinity[g] or model.geom_contype[g]}
-    corners = {f"corner_{leg}" for leg in ("fl", "fr", "rl", "rr")}
-    assert touching == {*FEET, *corners, "hull"}
+    others = {"front", "rear", *(foot.replace("foot", "knee") for foot in FEET)}
+    assert touching == {*FEET, *others, "hull"}
     ground = {name for name in touching if int(model.geom(name).conaffinity[0]) & 1}
-    assert ground == {*FEET, *corners}
+    assert ground == {*FEET, *others}
 
 
 def test_torque_stays_within_limits_and_finite_whatever_the_state():
@@ -214,3 +218,11 @@ def test_lies_down_when_lost_and_does_not_sink():
     assert most == 0.0
     assert 0.02 < bases[-1, 2] < 0.15
     assert np.linalg.norm(data.qvel[:3]) < 0.05
+
+
+def test_gets_up_from_lying_and_walks_on():
+    scene = scene_of(np.zeros((33, 33)))
+    data, bases, _ = drive(scene, command((1.0, 0.0)), 11.0, limp=3.0)
+    assert bases[round(3.0 / CONTROL_PERIOD) - 1, 2] < 0.15
+    assert np.linalg.norm(data.qpos[:2] - [1.0, 0.0]) < 0.1
+    assert abs(data.qpos[2] - LEGGED.spawn_height) < 0.03
