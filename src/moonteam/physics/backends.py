@@ -255,8 +255,9 @@ class NativeBackend:
         self._batch: Batch | None = None
         self._reset = jax.jit(jax.vmap(
             lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
-        self.controllers = jax.vmap(self._control_world, in_axes=(None, 0, 0, 0, 0, 0))
-        self._programs: dict[int, jax.stages.Compiled] = {}
+        # Called every control step, so jit's own fast dispatch rather than a compiled object.
+        self.controllers = jax.jit(jax.vmap(
+            self._control_world, in_axes=(None, 0, 0, 0, 0, 0)))
 
     def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
         """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
@@ -267,14 +268,11 @@ class NativeBackend:
     ) -> tuple[WorldState, Log]:
         """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
         _check_steps(num_control_steps, self.log_every)
-        batch = state.qpos.shape[0]
-        if batch not in self._programs:
-            self.compile(batch, num_control_steps)
-        control, commands = self._programs[batch], _strong(commands)
-        worlds = _Worlds(self._pool(batch), state)
+        commands = _strong(commands)
+        worlds = _Worlds(self._pool(state.qpos.shape[0]), state)
         controls, samples, powers, propellants = _strong(state.control), [], [], []
         for step in range(num_control_steps):
-            ctrl, controls, power, propellant = control(
+            ctrl, controls, power, propellant = self.controllers(
                 self.scene.surface, *worlds.seen(), controls, commands)
             worlds.step(np.asarray(ctrl), self._substeps)
             moving = ~worlds.diverged[:, None]
@@ -291,9 +289,9 @@ class NativeBackend:
         _check_steps(num_control_steps, self.log_every)
         state = self.reset(batch=batch)
         begun = time.perf_counter()
-        self._programs[batch] = jax.jit(self.controllers).lower(
-            self.scene.surface, state.time, state.qpos, state.qvel, state.control,
-            hold(self.scene, batch)).compile()
+        jax.block_until_ready(self.controllers(
+            self.scene.surface, *(np.asarray(a) for a in (state.time, state.qpos, state.qvel)),
+            state.control, hold(self.scene, batch)))
         return time.perf_counter() - begun
 
     def _control_world(self, surface: Surface, time: Array, qpos: Array, qvel: Array,

@@ -95,8 +95,8 @@ def _controllers_alone(scene: Scene, batch: int, seconds: float) -> float:
     """
     backend = NativeBackend(scene, threads=1)
     state, commands = backend.reset(batch=batch), drive(scene, batch)
-    control = jax.jit(backend.controllers)
     arguments = (scene.surface, state.time, state.qpos, state.qvel, state.control, commands)
-    jax.block_until_ready(control(*arguments))
-    rate = repeats_per_second(lambda: jax.block_until_ready(control(*arguments)), seconds)
+    jax.block_until_ready(backend.controllers(*arguments))
+    rate = repeats_per_second(
+        lambda: jax.block_until_ready(backend.controllers(*arguments)), seconds)
     return 1.0 / (rate * CONTROL_PERIOD * batch)

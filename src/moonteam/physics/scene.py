@@ -86,6 +86,7 @@ def build_scene(
     check_starts(site, placements)
     spec = mujoco.MjSpec()
     _set_options(spec, dt, iterations, ls_iterations)
+    _bound_contacts(spec, len(placements))
     _add_ground(spec, site, friction)
     for index, boulder in enumerate(site.boulders):
         _add_boulder(spec, index, boulder, friction)
@@ -180,11 +181,16 @@ def _set_options(spec: mujoco.MjSpec, dt: float, iterations: int, ls_iterations:
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    # MJX has a row for every contact that could ever be. These bounds keep the nearest pairs
-    # where many boulders stand, and the deepest contacts: enough for all feet and wheels of
-    # three robots, each on two facets.
-    spec.add_numeric(name="max_geom_pairs", data=[8])
-    spec.add_numeric(name="max_contact_points", data=[24])
+
+
+def _bound_contacts(spec: mujoco.MjSpec, robots: int) -> None:
+    """Bounds MJX's work, which has a row for every contact that could ever be.
+
+    Kept are the nearest pairs where many boulders stand, and the deepest contacts: enough
+    for four feet or wheels a robot, each on two facets.
+    """
+    spec.add_numeric(name="max_geom_pairs", data=[4 + 4 * robots])
+    spec.add_numeric(name="max_contact_points", data=[8 * max(robots, 1)])
 
 
 def _add_ground(spec: mujoco.MjSpec, site: Site, friction: float) -> None:
