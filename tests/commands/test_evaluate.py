@@ -9,6 +9,7 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.evaluation import env_speed, timing
+from moonteam.evaluation.contenders import Planned
 from moonteam.policies import checkpoint, recurrent
 from moonteam.policies.recurrent import RecurrentSpec
 
@@ -99,6 +100,24 @@ def test_replanning_has_the_oracle_and_both_forms(capsys, tmp_path):
         assert row["M_tte"] == pytest.approx(384 - row["moves"])
     assert (tmp_path / "replanning.png").exists()
     assert without_times(output(capsys, *words)) == without_times(document)
+
+
+def test_interrupted_what_is_done_is_saved(capsys, monkeypatch, tmp_path):
+    whole = Planned.run
+
+    def run(self, world):
+        if self.kind == "greedy":
+            raise KeyboardInterrupt
+        return whole(self, world)
+
+    monkeypatch.setattr(Planned, "run", run)
+    words = ["evaluate", "grid", str(GOLDEN), "--limit", "3", "--out", str(tmp_path / "out")]
+    assert main([*words, "--planner", "exact", "--planner", "greedy"]) == 130
+    assert "lacks greedy(makespan)" in capsys.readouterr().err
+    saved = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [row["planner"] for row in saved["summary"]] == ["exact(makespan)"]
+    assert main([*words[:-1], str(tmp_path / "none"), "--planner", "greedy"]) == 130
+    assert not (tmp_path / "none").exists()
 
 
 def broken(tmp_path, text):

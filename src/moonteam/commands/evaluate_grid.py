@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,8 +117,17 @@ def _scenarios(args: Args) -> tuple[list[Scenario], str]:
                    f"{len(found)} scenarios")
 
 
+def finished(document: dict) -> int:
+    """The exit code of a report, and a word on standard error if it was cut short."""
+    if "interrupted" not in document:
+        return 0
+    left = ", ".join(document["interrupted"])
+    print(f"moonteam: interrupted; the report lacks {left}", file=sys.stderr)
+    return 130
+
+
 def run(args: Args) -> int:
-    """Evaluates, prints, saves; 0 whatever the planners achieved."""
+    """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
     from moonteam.evaluation import figures, grid, report
     from moonteam.evaluation.contenders import Options, contenders
@@ -146,4 +156,4 @@ def run(args: Args) -> int:
         print(report.markdown(document, grid.PAGE))
     else:
         report.show(document, grid.COLUMNS)
-    return 0
+    return finished(document)

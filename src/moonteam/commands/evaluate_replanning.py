@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from moonteam import compilation, files, paths
-from moonteam.commands.evaluate_grid import Many, command_line, drawn, load_set
+from moonteam.commands.evaluate_grid import Many, command_line, drawn, finished, load_set
 from moonteam.errors import InputError
 from moonteam.scenario import Scenario
 
@@ -85,7 +85,7 @@ def _scenarios(args: Args) -> tuple[list[Scenario], str]:
 
 
 def run(args: Args) -> int:
-    """Evaluates, prints, saves; 0 whatever the planners achieved."""
+    """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
     from moonteam.evaluation import figures, replanning, report
     from moonteam.evaluation.contenders import Options, contenders
@@ -117,4 +117,4 @@ def run(args: Args) -> int:
         print(report.markdown(document, replanning.PAGE))
     else:
         report.show(document, replanning.COLUMNS)
-    return 0
+    return finished(document)

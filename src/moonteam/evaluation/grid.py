@@ -8,6 +8,7 @@ from moonteam.evaluation import metrics, optima, provenance, report
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.bootstrap import RESAMPLES, Bootstrap
 from moonteam.evaluation.contenders import Contender
+from moonteam.evaluation.world import World
 from moonteam.scenario import Scenario
 
 PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
@@ -20,13 +21,35 @@ PAGE = tuple(c for c in COLUMNS if c.key not in ("M_st", "M_tte", "decisions"))
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int, title: str,
              command: str) -> dict:
-    """The whole report as a JSON-able document. Raises InputError before anything is run."""
+    """The whole report as a JSON-able document.
+
+    Raises InputError before anything is run. Interrupted, it reports the rows that are done
+    (see `run_all`).
+    """
     world = worlds.build(scenarios)
     for contender in rows:
         contender.check(world)
-    found = [contender.run(world) for contender in rows]
+    found = run_all(rows, world)
     reference = optima.reference(world.scenarios)
-    return document(world.family, found, reference, seed, title, command)
+    return document(world.family, found, reference, seed, title, command) | missing(found, rows)
+
+
+def run_all(rows: Sequence[Contender], world: World, least: int = 1) -> list[metrics.Outcomes]:
+    """What each contender did; after Ctrl-C what those before it did, if at least `least`."""
+    found = []
+    try:
+        for contender in rows:
+            found.append(contender.run(world))
+    except KeyboardInterrupt:
+        if len(found) < least:
+            raise
+    return found
+
+
+def missing(found: Sequence[metrics.Outcomes], rows: Sequence[Contender]) -> dict:
+    """Names of the rows that an interruption left out, as part of the document."""
+    names = [row.name for row in rows[len(found):]]
+    return {"interrupted": names} if names else {}
 
 
 def document(family: metrics.Family, found: Sequence[metrics.Outcomes],

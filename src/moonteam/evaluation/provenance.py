@@ -14,13 +14,14 @@ PACKAGES = ("moonteam", "jax", "jaxlib", "numpy", "numba", "flax")
 
 
 def commit() -> str | None:
-    """The checkout's commit, with -dirty if tracked files differ; None in a wheel."""
+    """The checkout's commit, with -dirty if code or assets differ; None in a wheel."""
     folder = Path(moonteam.__file__).resolve().parent
     top = _git(folder, "rev-parse", "--show-toplevel")
     if top is None or not folder.is_relative_to(top) or folder != Path(top) / "src" / "moonteam":
         return None  # a wheel inside some other project's checkout
     found = _git(folder, "rev-parse", "--short=12", "HEAD")
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    parts = [str(Path(top) / name) for name in ("src", "training", "sim2grid", "assets")]
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *parts)
     return f"{found}-dirty" if found and changed else found
 
 

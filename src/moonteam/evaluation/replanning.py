@@ -55,8 +55,9 @@ def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], num_new: 
     ordered = [*oracle, *(row for row in rows if row.name not in names)]
     for contender in ordered:
         contender.check(world)
-    found = [contender.run(world) for contender in ordered]
+    found = grid.run_all(ordered, world, least=len(ORACLE))
     document = grid.document(world.family, found, _reference(found), seed, title, command)
+    document |= grid.missing(found, ordered)
     document["notes"].insert(0, _hindsight(scenarios))
     shown = sorted({len(s.targets) - num_new for s in scenarios})
     document["notes"].insert(0, f"{' or '.join(map(str, shown))} targets at the start and "
