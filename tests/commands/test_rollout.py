@@ -58,6 +58,7 @@ def test_bad_missions_one_line_code_two_nothing_written(tmp_path, capsys, old, n
     (["--seed", "-1"], "--seed"),
     (["--decode", "best-of-many"], "--decode"),
     (["--planner", "policy", "--policy", "nobody"], "nobody"),
+    (["--planner", "policy"], "made for 3 robots"),
 ])
 def test_bad_options_one_line_code_two_nothing_written(tmp_path, capsys, options, named):
     file, out = tmp_path / "good.yaml", tmp_path / "out"
