@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -14,10 +14,19 @@ from moonteam import files
 from training import config as configs
 from training.config import Config
 
+if TYPE_CHECKING:
+    from training import imitate
+
+IMITATION = ("quick", "any_team")
+"""Presets that imitate the exact planner; see `training.imitate`."""
+
 
 @dataclass(frozen=True)
 class Args:
-    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's), small, laptop.
+    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's), small.
+
+    The presets quick and any_team imitate the exact planner instead, for teams of any size; they
+    have options of their own: moonteam train quick --help.
 
     The first word after `train` is the preset; every number of it can be changed by an option.
 
@@ -42,11 +51,15 @@ class Args:
     """One JSON document on standard output: the report, or the dry run's table."""
 
 
-def parse(words: list[str]) -> Args:
+def parse(words: list[str]) -> Args | imitate.Args:
     """Arguments of the command; the preset's numbers are the defaults of all options.
 
     Raises InputError for a preset that does not exist.
     """
+    if words and words[0] in IMITATION:
+        from training import imitate
+
+        return imitate.parse(words)
     named = bool(words) and not words[0].startswith("-")
     asks_help = any(word in ("-h", "--help") for word in words)
     if not named and not asks_help:
@@ -57,11 +70,15 @@ def parse(words: list[str]) -> Args:
                     args=rest)
 
 
-def run(args: Args) -> int:
+def run(args: Args | imitate.Args) -> int:
     """Trains, or describes; returns the exit code."""
     from moonteam.compilation import enable_cache
 
     enable_cache()
+    if not isinstance(args, Args):
+        from training import imitate
+
+        return imitate.run(args)
     if args.dry_run:
         from training import account
 
