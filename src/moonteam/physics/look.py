@@ -49,7 +49,7 @@ def _light(spec: mujoco.MjSpec) -> None:
         math.cos(SUN_ELEVATION) * math.sin(SUN_AZIMUTH), math.sin(SUN_ELEVATION)])
     spec.worldbody.add_light(
         name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=direction,
-        pos=-30 * direction, diffuse=[1.45, 1.42, 1.35], specular=[0.15, 0.15, 0.15],
+        pos=-30 * direction, diffuse=[1.25, 1.23, 1.17], specular=[0.15, 0.15, 0.15],
         ambient=[0, 0, 0], castshadow=True)
     spec.visual.headlight.ambient = [0.17, 0.17, 0.19]
     spec.visual.headlight.diffuse = [0.13, 0.13, 0.14]
