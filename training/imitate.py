@@ -7,20 +7,25 @@ labelled states included) and, at the end, `policy.safetensors`, `report.json`, 
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import sys
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+import tyro
 from jax import Array
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.evaluation.progress import track
+from moonteam.evaluation.progress import say, track
 from moonteam.grid import env
 from moonteam.planners.batch import solve_batch
 from moonteam.policies.checkpoint import PolicyFile, save_policy
@@ -38,7 +43,7 @@ from training.imitation import (
     on_ground,
     views,
 )
-from training.loop import Stop, commit, describe_device
+from training.loop import Stop, commit, describe_device, stop_on_signals
 
 CHECKPOINT_SECONDS = 60.0
 SCENARIOS = 256
@@ -60,6 +65,63 @@ PRESETS = {
         rounds=1500, batches=2),
 }
 """Presets of `moonteam train` that imitate the exact planner."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Train the policy for any team by imitating the exact planner: quick or any_team.
+
+    Examples:
+      moonteam train quick
+      moonteam train quick --seed 1 --out runs/quick-1
+      moonteam train any_team --out runs/any --resume
+    """
+
+    preset: tyro.conf.Positional[Literal["quick", "any_team"]]
+    """quick: 3 robots, 5 to 7 targets, 32 x 32; any_team: teams, maps and ground of all sizes."""
+    seed: int = 0
+    """Seed of everything random in the run."""
+    rounds: int | None = None
+    """Rounds of visiting, labelling and learning; the preset's number if not given."""
+    out: Path | None = None
+    """Run folder; runs/PRESET-SEED if not given."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    json: bool = False
+    """Print the report as one JSON document and nothing else."""
+
+
+def parse(words: list[str]) -> Args:
+    """Arguments of `moonteam train quick|any_team`."""
+    return tyro.cli(Args, prog="moonteam train", args=words, description=inspect.getdoc(Args),
+                    config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(args: Args) -> int:
+    """Trains; returns the exit code."""
+    rounds = PRESETS[args.preset].rounds if args.rounds is None else args.rounds
+    if rounds < 1:
+        raise InputError("--rounds", f"{rounds} is not allowed; at least 1")
+    config = dataclasses.replace(PRESETS[args.preset], seed=args.seed, rounds=rounds)
+    out = args.out or Path("runs") / f"{args.preset}-{args.seed}"
+    say("moonteam: making grounds and held-out scenarios, compiling")
+    work = Run(args.preset, config, out, args.resume)
+    with stop_on_signals() as stop:
+        finished = work.train(stop)
+    if not finished:
+        print(f"moonteam: interrupted after round {work.dagger.number}, saved; go on with "
+              f"--out {out} --resume", file=sys.stderr)
+        return 130
+    report = work.finish()
+    if args.json:
+        print(files.dump_json(report | {"out": str(out)}))
+        return 0
+    for row in report["families"]:
+        print(f"{row['family']}: success {row['success']:.3f}, makespan gap "
+              f"{row['makespan_gap']:.1%}, moves gap {row['moves_gap']:.1%}")
+    print(f"{report['labelled']:,} labelled states in {report['seconds']:.0f} s; policy, curve "
+          f"and report in {out}")
+    return 0
 
 
 class Score(NamedTuple):
@@ -198,10 +260,10 @@ class Run:
     def _load(self) -> None:
         dagger = self.dagger
         try:
-            with np.load(self.state_file) as stored:
+            with self.state_file.open("rb") as raw, np.load(raw) as stored:
                 about = msgspec.json.decode(stored["about"].tobytes())
                 arrays = [stored[f"leaf{i}"] for i in range(len(stored.files) - 1)]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise InputError(self.state_file, f"is torn ({error}); delete it to start again"
                              ) from None
         dagger.number, self.seconds, self.rows = about["number"], about["seconds"], about["rows"]
@@ -271,8 +333,8 @@ def draw_curve(path: Path, rows: list[dict[str, Any]]) -> None:
                                   "moves gap, preference 1"), strict=True):
         axis.set_title(title)
         axis.set_xlabel("labelled states")
-    axes[1].set_yscale("log")
-    axes[2].set_yscale("log")
+    for axis in axes[1:]:
+        axis.set_yscale("symlog", linthresh=0.01)
     axes[0].legend(fontsize=7)
     with files.replacing(path) as temporary:
         figure.savefig(temporary, dpi=120)
