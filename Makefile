@@ -10,7 +10,7 @@ demo: $(STAMP)
 	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.json"
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=15
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

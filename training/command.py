@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ def parse(words: list[str]) -> Args | imitate.Args:
     name, rest = (words[0], words[1:]) if named else ("small", words)
     default = Args(configs.preset(name))
     return tyro.cli(Args, prog=f"moonteam train {name if named else 'PRESET'}", default=default,
-                    args=rest)
+                    args=rest, description=inspect.getdoc(Args))
 
 
 def run(args: Args | imitate.Args) -> int:

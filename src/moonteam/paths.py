@@ -17,8 +17,10 @@ def assets() -> Path:
 def find(name: str, folder: str, suffix: str) -> Path:
     """A user's file, else the bundled asset of that name (``demo`` for missions/demo.yaml)."""
     path = Path(name)
-    if path.exists() or (path.suffix == suffix and path.parent != Path()):
+    if path.exists():
         return path
+    if path.suffix == suffix and path.parent != Path():
+        raise InputError(name, "no such file")
     bundled = assets() / folder / (name if name.endswith(suffix) else name + suffix)
     if bundled.is_file():
         return bundled
