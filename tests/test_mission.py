@@ -69,6 +69,10 @@ BAD = {
     "cell size": ("cell_m: 1.5", "cell_m: .nan", "map.cell_m: nan is not allowed"),
     "two sites": ("preset: mare", "preset: mare, dem: a.tif", "site: give one of preset and dem"),
     "event of nobody": ("lost: flyer", "lost: yutu", "events[0].lost: no robot is named 'yutu'"),
+    "event's skill nobody has": ("lost: flyer", "target: {at: [2, 2], skills: [drill]}",
+                                 "events[0].target.skills: no robot has skill drill"),
+    "event off the map": ("lost: flyer", "target: {at: [8, 2], skills: [A]}",
+                          "events[0].target.at: cell [8, 2] is off the map"),
     "path in a name": ("name: flyer", "name: ../x", "robots[0].name: '../x' is not allowed"),
     "not YAML": ("map: {", "map: [", "not YAML:"),
 }

@@ -182,3 +182,8 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
     if event.target is not None:
         scenario.check_cell(event.target.at, mission.map.size,
                             lambda p: InputError(source, p, f"{key}.target.at"))
+        team = {s for r in mission.robots for s in r.skills}
+        need = set(event.target.skills)
+        if not need or (event.target.type == "AND" and need - team) or not need & team:
+            raise InputError(source, f"no robot has skill {', '.join(sorted(need - team)) or '?'}; "
+                             f"the team has {', '.join(sorted(team))}", f"{key}.target.skills")
