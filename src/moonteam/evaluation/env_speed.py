@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import io
+import os
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,10 +71,28 @@ def ours(load: Load, num_targets: int) -> tuple[Callable, Any]:
     return run, jax.jit(jax.vmap(lambda k: env.reset(config, k)[0]))(keys)
 
 
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Nothing reaches standard output: jaxmarl prints when it is imported, and what it imports
+    puts the process's own standard output back, so the descriptor itself is turned away.
+    """
+    sys.stdout.flush()
+    stream, kept = sys.stdout, os.dup(1)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+            sys.stdout = stream
+            os.dup2(kept, 1)
+            os.close(kept)
+
+
 def peer(load: Load) -> tuple[Callable, Any] | None:
     """The same of JaxMARL's env; None where jaxmarl is not installed."""
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it chats when it is imported
+        with _quiet():
             from jaxmarl import make
     except ImportError:
         return None
