@@ -2,7 +2,6 @@
 
 import os
 
-os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
