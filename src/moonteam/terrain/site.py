@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -68,8 +69,12 @@ class Site:
 
     @functools.cached_property
     def surface(self) -> Surface:
-        """The ground as a function of (x, y), without boulders."""
-        return Surface(jnp.asarray(self.heights, jnp.float32), self.spacing)
+        """The ground as a function of (x, y), without boulders.
+
+        Made outside any trace, since it is kept and would carry the first tracer along.
+        """
+        with jax.ensure_compile_time_eval():
+            return Surface(jnp.asarray(self.heights, jnp.float32), self.spacing)
 
     @property
     def extent(self) -> tuple[float, float]:
