@@ -90,15 +90,14 @@ def plan_of_trace(snapshot: Snapshot, trace: Trace, claim: Certificate, seconds:
     scheduled, by agents that pass.
     """
     visits = []
-    for step in range(1, len(trace.solved)):
-        for target in np.flatnonzero(trace.solved[step] & ~trace.solved[step - 1]).tolist():
-            here = (trace.cells[step] == snapshot.target_cells[target]).all(-1)
-            here &= snapshot.agent_mask
-            sent = [a for a, route in enumerate(routes or ()) if target in route]
-            if not sent or not here[sent].all():
-                shares = snapshot.agent_skills & snapshot.target_skills[target] != 0
-                sent = np.flatnonzero(here & shares).tolist()
-            visits.append(Visit(target, tuple(sent), step))
+    for before, target in np.argwhere(trace.solved[1:] & ~trace.solved[:-1]).tolist():
+        here = (trace.cells[before + 1] == snapshot.target_cells[target]).all(-1)
+        here &= snapshot.agent_mask
+        sent = [a for a, route in enumerate(routes or ()) if target in route]
+        if not sent or not here[sent].all():
+            shares = snapshot.agent_skills & snapshot.target_skills[target] != 0
+            sent = np.flatnonzero(here & shares).tolist()
+        visits.append(Visit(target, tuple(sent), before + 1))
     already = np.flatnonzero(holding(snapshot) & ~snapshot.solved).tolist()
     standing = [Visit(t, _standing(snapshot, t), 0) for t in already]
     return Plan(planner=claim.planner, objective=claim.objective,

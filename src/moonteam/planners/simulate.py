@@ -75,16 +75,32 @@ class Trace:
 
 def replay(snapshot: Snapshot, actions: Iterable[npt.ArrayLike]) -> Trace:
     """Plays joint actions until all targets are solved or the actions or steps run out."""
-    now = replace(snapshot, solved=holding(snapshot))
-    cells, solved, done = [now.cells], [now.solved], []
-    for joint in actions:
-        if now.solved.all() or now.step >= now.max_steps:
-            break
-        chosen = np.where(now.agent_mask, np.asarray(joint, np.int32), STAY)
-        now = step(now, chosen)
-        cells.append(now.cells)
-        solved.append(now.solved)
-        done.append(chosen)
     agents = len(snapshot.cells)
-    return Trace(np.array(cells), np.array(solved),
-                 np.array(done, np.int32).reshape(len(done), agents))
+    joint = np.array(list(actions), np.int32).reshape(-1, agents)
+    joint = joint[:max(snapshot.max_steps - snapshot.step, 0)]
+    chosen = np.where(snapshot.agent_mask, joint, STAY).astype(np.int32)
+    cells = _walked(snapshot, chosen)
+    here = (cells[:, :, None] == snapshot.target_cells).all(-1)  # [T + 1, N, M]
+    skills = np.where(snapshot.agent_mask, snapshot.agent_skills, 0)[:, None]
+    present = np.bitwise_or.reduce(np.where(here, skills, 0), axis=1) & snapshot.target_skills
+    meets = np.where(snapshot.target_and, present == snapshot.target_skills, present != 0)
+    solved = np.logical_or.accumulate(meets | snapshot.solved)  # [T + 1, M]
+    done = solved.all(-1)
+    length = int(done.argmax()) if done.any() else len(chosen)
+    return Trace(cells[:length + 1], solved[:length + 1], chosen[:length])
+
+
+def _walked(snapshot: Snapshot, actions: IntArray) -> IntArray:
+    """Cells [T + 1, N, 2] of joint actions [T, N]; all steps at once if none is thrown back."""
+    ways = np.concatenate([snapshot.cells[None], DISPLACEMENTS[actions]])
+    cells = ways.cumsum(0, dtype=np.int32)
+    free = (cells >= 0).all(-1) & (cells < np.array(snapshot.size)).all(-1)
+    if snapshot.passable is not None and free.all():
+        free &= snapshot.passable[snapshot.agent_kinds, cells[..., 1], cells[..., 0]]
+    if free[1:].all():
+        return cells
+    now = snapshot
+    for t, joint in enumerate(actions):
+        now = replace(now, cells=moved(now, joint))
+        cells[t + 1] = now.cells
+    return cells
