@@ -94,7 +94,7 @@ def _walked(snapshot: Snapshot, actions: IntArray) -> IntArray:
     """Cells [T + 1, N, 2] of joint actions [T, N]; all steps at once if none is thrown back."""
     ways = np.concatenate([snapshot.cells[None], DISPLACEMENTS[actions]])
     cells = ways.cumsum(0, dtype=np.int32)
-    free = (cells >= 0).all(-1) & (cells < np.array(snapshot.size)).all(-1)
+    free = np.all((cells >= 0) & (cells < np.array(snapshot.size)), axis=-1)
     if snapshot.passable is not None and free.all():
         free &= snapshot.passable[snapshot.agent_kinds, cells[..., 1], cells[..., 0]]
     if free[1:].all():
