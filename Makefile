@@ -1,5 +1,8 @@
 # Needs Python 3.11 or 3.12, make and the network; everything else is set up here.
-PYTHON ?= $(shell command -v python3.12 || command -v python3.11 || command -v python3)
+FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+# The first that runs and fits: a name on the PATH may be a shim with nothing behind it.
+PYTHON ?= $(shell for p in python3 python3.12 python3.11; do \
+  $$p -c '$(FITS)' >/dev/null 2>&1 && { echo $$p; break; }; done)
 BIN := .venv/bin
 STAMP := .venv/.installed
 
@@ -23,7 +26,7 @@ wheel: $(STAMP)
 check: lint test demo wheel
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || \
+	@test -n "$(PYTHON)" && $(PYTHON) -c '$(FITS)' || \
 	  { echo "moonteam needs Python 3.11 or 3.12; say which with: make PYTHON=/path/to/python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,ortools]'
