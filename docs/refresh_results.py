@@ -35,7 +35,9 @@ def made(command: str) -> str:
         extra = ["--out", folder] if figure else []
         program = Path(sys.executable).with_name(words[0])
         done = subprocess.run([program, *words[1:], "--markdown", *extra], text=True,
-                              stdout=subprocess.PIPE, check=True)
+                              stdout=subprocess.PIPE, check=False)
+        if done.returncode not in (0, 1):  # 1: something in the table failed, which it shows
+            raise SystemExit(f"{command}: exit code {done.returncode}")
         if figure:
             (PAGE.parent / "images").mkdir(exist_ok=True)
             shutil.copy(next(Path(folder).glob("*.png")), PAGE.parent / "images" / figure)

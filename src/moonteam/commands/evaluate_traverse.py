@@ -58,6 +58,9 @@ class Args:
     json: bool = False
     """print one JSON document and nothing else"""
 
+    markdown: bool = False
+    """print the table for a page of docs, with command, commit and machine"""
+
     out: Path | None = None
     """folder for traverse.json and traverse.csv"""
 
@@ -88,7 +91,10 @@ def run(args: Args) -> int:
     if args.out:
         write_json(args.out / "traverse.json", report)
         _write_csv(args.out / "traverse.csv", rows)
-    print(dump_json(report, 2) if args.json else _table(summaries))
+    if args.markdown:
+        print(_markdown(args, summaries))
+    else:
+        print(dump_json(report, 2) if args.json else _table(summaries))
     return 0 if all(r.outcome == "arrived" for r in rows) else 1
 
 
@@ -162,3 +168,30 @@ def _table(summaries: list[dict]) -> str:
                      f"{s['tilt_max_deg']:>6.1f}")
         lines.append(line)
     return "\n".join(lines)
+
+
+def _markdown(args: Args, summaries: list[dict]) -> str:
+    """The summaries as a table of docs/results.md."""
+    from moonteam.evaluation import provenance
+
+    command = (f"moonteam evaluate traverse --kind {' '.join(args.kind)} --site {args.site} "
+               f"--count {args.count} --sites {args.sites} --seed {args.seed} "
+               f"--length {args.length:g} --backend {args.backend}")
+    columns = {
+        "kind": "{kind}", "arrived": "{arrived} of {count}",
+        "95 %": "{arrived_interval[0]:.3f} to {arrived_interval[1]:.3f}",
+        "fell": "{fallen}", "stuck": "{stuck}", "late": "{late}", "diverged": "{diverged}"}
+    means = {
+        "speed, m/s": "{speed_mps:.2f}", "cross-track rms, m": "{cross_track_rms_m:.3f}",
+        "p95, m": "{cross_track_p95_m:.3f}", "energy, J/m": "{energy_j_per_m:.1f}",
+        "propellant, g": "{propellant_g:.1f}", "tilt p95, deg": "{tilt_p95_deg:.1f}",
+        "tilt max, deg": "{tilt_max_deg:.1f}", "routes drawn": "{route_draws}"}
+    lines = [f"`{command}`", "", "| " + " | ".join([*columns, *means]) + " |",
+             "|" + "---|" * (len(columns) + len(means))]
+    for summary in summaries:
+        cells = [text.format(**summary) for text in columns.values()]
+        cells += [text.format(**summary) if summary["arrived"] else "-" for text in means.values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    seeds = ", ".join(str(seed) for seed in _seeds(args))
+    return "\n".join([*lines, "", f"- Site seeds {seeds}; means are over arrivals.",
+                      f"- {provenance.hardware_line(provenance.meta(command, args.seed))}"])
