@@ -1,5 +1,7 @@
 """The host's twin of the grid rules, and travel times, against the environment's own."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +41,23 @@ def test_the_twin_steps_as_the_environment():
             assert int(state.step) == now.step
         solved += int(now.solved.sum())
     assert solved > 5
+
+
+@pytest.mark.parametrize("blocked", [GROUND, None], ids=["blocked", "open"])
+def test_a_whole_replay_is_the_replay_step_by_step(blocked):
+    rng = np.random.default_rng(1)
+    ended = 0
+    for seed in range(30):
+        kinds = ("drone", "legged", "wheeled") if blocked else None
+        start = Snapshot.start(grid.generate(seed, num_targets=2, size=(4, 4), max_steps=30,
+                                             blocked=blocked, kinds=kinds))
+        start = replace(start, agent_mask=np.array([True, seed % 3 > 0, True]))
+        joint = rng.integers(0, 5, (40, 3)).astype(np.int32)
+        slow, fast = simulate.replay(start, iter(joint)), simulate.replay_whole(start, joint)
+        for name in ("cells", "solved", "actions"):
+            np.testing.assert_array_equal(getattr(slow, name), getattr(fast, name))
+        ended += slow.complete
+    assert 0 < ended < 30
 
 
 def test_travel_times_are_the_environments():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from moonteam.planners.base import IntArray, Objective, Plan, Snapshot, Visit
-from moonteam.planners.simulate import STAY, Trace, holding, replay
+from moonteam.planners.simulate import STAY, Trace, holding, replay_whole
 from moonteam.planners.travel import UNREACHABLE, Travel, walk
 
 Routes = Sequence[Sequence[int]]
@@ -116,7 +116,7 @@ def _standing(snapshot: Snapshot, target: int) -> tuple[int, ...]:
 def plan_of_routes(snapshot: Snapshot, travel: Travel, routes: Routes, claim: Certificate,
                    seconds: float) -> Plan:
     """The plan that follows the routes; raises ValueError if it leaves a target unsolved."""
-    trace = replay(snapshot, actions_of(snapshot, travel, routes))
+    trace = replay_whole(snapshot, actions_of(snapshot, travel, routes))
     if not trace.complete:
         raise ValueError(f"targets {np.flatnonzero(~trace.solved[-1]).tolist()} stay unsolved")
     return plan_of_trace(snapshot, trace, claim, seconds, routes)

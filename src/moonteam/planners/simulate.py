@@ -74,10 +74,28 @@ class Trace:
 
 
 def replay(snapshot: Snapshot, actions: Iterable[npt.ArrayLike]) -> Trace:
-    """Plays joint actions until all targets are solved or the actions or steps run out."""
+    """Plays joint actions until all targets are solved or the actions or steps run out.
+
+    They are asked for one by one, so an endless source of decisions will do.
+    """
+    now = replace(snapshot, solved=holding(snapshot))
+    cells, solved, done = [now.cells], [now.solved], []
+    for joint in actions:
+        if now.solved.all() or now.step >= now.max_steps:
+            break
+        chosen = np.where(now.agent_mask, np.asarray(joint, np.int32), STAY)
+        now = step(now, chosen)
+        cells.append(now.cells)
+        solved.append(now.solved)
+        done.append(chosen)
     agents = len(snapshot.cells)
-    joint = np.array(list(actions), np.int32).reshape(-1, agents)
-    joint = joint[:max(snapshot.max_steps - snapshot.step, 0)]
+    return Trace(np.array(cells), np.array(solved),
+                 np.array(done, np.int32).reshape(len(done), agents))
+
+
+def replay_whole(snapshot: Snapshot, actions: IntArray) -> Trace:
+    """`replay` of a list [T, N] known beforehand, all steps at once."""
+    joint = actions[:max(snapshot.max_steps - snapshot.step, 0)]
     chosen = np.where(snapshot.agent_mask, joint, STAY).astype(np.int32)
     cells = _walked(snapshot, chosen)
     here = (cells[:, :, None] == snapshot.target_cells).all(-1)  # [T + 1, N, M]
