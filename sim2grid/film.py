@@ -92,7 +92,8 @@ class Film:
         self.times = np.concatenate(record.times)
         self.qpos = np.concatenate(record.qpos)
         self.paths = [self.qpos[:, b:b + 2].astype(float) for b in bases]
-        self._close: dict[int, Image.Image] = {}  # drawn afresh in every second frame
+        # Drawn afresh in every second frame, and when a target is solved.
+        self._close: dict[int, tuple[frozenset[int], Image.Image]] = {}
         self.speed = playback(record.seconds())
         side = 190 if views else HEIGHT - 2 * MARGIN
         self.map = MapPicture(frame, ground, side, barred)
@@ -238,9 +239,11 @@ class Film:
             x, y = MARGIN + i * (width + MARGIN), HEIGHT - MARGIN - height
             color = robot_color(i)
             pen.rectangle([x - 2, y - 2, x + width + 1, y + height + 1], fill=(*color, 255))
-            if i not in self._close or round(moment.time_s / self.speed * FPS) % 2 == 0:
-                self._close[i] = Image.fromarray(self.views.close(moment, qpos, i))
-            image.paste(self._close[i], (x, y))
+            even = round(moment.time_s / self.speed * FPS) % 2 == 0
+            if even or i not in self._close or self._close[i][0] != moment.solved:
+                drawn = Image.fromarray(self.views.close(moment, qpos, i))
+                self._close[i] = (moment.solved, drawn)
+            image.paste(self._close[i][1], (x, y))
             draw_robot(pen, spec.kind, (x + 12, y + 12), 6, color)
             _shadowed(pen, (x + 23, y + 3), f"{spec.name} ({''.join(spec.skills)})", 12, color)
             _shadowed(pen, (x + 6, y + height - 18), moment.status[i], 12, INK)
