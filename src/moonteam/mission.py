@@ -123,22 +123,27 @@ def check(mission: Mission, source: object) -> Mission:
     _check_names(mission, source)
     if not mission.robots:
         raise InputError(source, "at least one robot is needed", "robots")
-    grid = _as_mission_keys(mission, source)
-    lacking = scenario.missing_skills(grid)
-    if lacking:
-        j, skills = next(iter(lacking.items()))
-        raise InputError(source, f"no robot has skill {', '.join(skills)}; the team has "
-                         + ", ".join(sorted({s for r in mission.robots for s in r.skills})),
-                         f"targets[{j}].skills")
+    _as_mission_keys(mission, source)
+    for j, target in enumerate(mission.targets):
+        _check_skills(mission, target, source, f"targets[{j}].skills")
     for e, event in enumerate(mission.events):
         _check_event(mission, event, source, f"events[{e}]")
     return mission
 
 
-def _as_mission_keys(mission: Mission, source: object) -> scenario.Scenario:
+def _check_skills(mission: Mission, target: Target, source: object, key: str) -> None:
+    """Raises InputError if the team can never solve the target."""
+    alone = msgspec.structs.replace(
+        mission.scenario(), targets=(scenario.Target(target.at, target.skills, target.type),))
+    for skills in scenario.missing_skills(alone).values():
+        raise InputError(source, f"no robot has skill {', '.join(skills) or '?'}; the team has "
+                         + ", ".join(sorted({s for r in mission.robots for s in r.skills})), key)
+
+
+def _as_mission_keys(mission: Mission, source: object) -> None:
     """Checks the grid problem, with keys named as they stand in the mission file."""
     try:
-        return scenario.check(mission.scenario(), source)
+        scenario.check(mission.scenario(), source)
     except InputError as error:
         key = error.key
         if key.startswith("agents["):
@@ -182,8 +187,4 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
     if event.target is not None:
         scenario.check_cell(event.target.at, mission.map.size,
                             lambda p: InputError(source, p, f"{key}.target.at"))
-        team = {s for r in mission.robots for s in r.skills}
-        need = set(event.target.skills)
-        if not need or (event.target.type == "AND" and need - team) or not need & team:
-            raise InputError(source, f"no robot has skill {', '.join(sorted(need - team)) or '?'}; "
-                             f"the team has {', '.join(sorted(team))}", f"{key}.target.skills")
+        _check_skills(mission, event.target, source, f"{key}.target.skills")
