@@ -82,13 +82,16 @@ class World:
 
 @pytest.fixture(scope="session")
 def make_world():
-    """make_world(kind, heights [ny, nx] m, xy, yaw) -> World. Controllers compile once a kind."""
+    """make_world(kind, heights [ny, nx] m, xy, yaw, boulders) -> World.
+
+    Controllers compile once a kind.
+    """
     compiled = {}
 
-    def make(kind: RobotKind, heights, xy=(0.0, 0.0), yaw: float = 0.0) -> World:
+    def make(kind: RobotKind, heights, xy=(0.0, 0.0), yaw: float = 0.0, boulders=()) -> World:
         if kind.name not in compiled:
             compiled[kind.name] = jax.jit(kind.control)
-        site = Site("test", 0, np.asarray(heights, np.float32), SPACING)
+        site = Site("test", 0, np.asarray(heights, np.float32), SPACING, tuple(boulders))
         scene = build_scene(site, [Placement("robot", kind, xy, yaw)])
         return World(kind, scene, compiled[kind.name])
 

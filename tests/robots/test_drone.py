@@ -7,6 +7,7 @@ import pytest
 from moonteam.robots import drone
 from moonteam.robots.base import GRAVITY, Command
 from moonteam.robots.drone import DRONE
+from moonteam.terrain.site import Boulder
 
 WEIGHT = 5.0 * GRAVITY
 
@@ -61,6 +62,28 @@ def test_stays_above_the_ground(flight):
     cruising = track.time > 4.0
     assert height[cruising].min() > 1.0
     assert height[cruising].max() < 2.6
+
+
+@pytest.mark.parametrize("start", [-7.0, -2.2])
+def test_flies_over_a_boulder_taller_than_itself(make_world, ground, start):
+    """1.8 m high in the way, in full flight and right after take-off."""
+    rock = Boulder(np.array([0.0, 0.1, 0.6]), 1.2, np.zeros((0, 3)))
+    world = make_world(DRONE, ground.flat(), (start, 0.0), boulders=[rock])
+    touched = []
+
+    def look(qpos):
+        del qpos
+        touched.append(world.scene.model.geom("boulder0").id in world.data.contact.geom)
+        return to((7.0, 0.0))
+
+    track = world.drive(look, 14.0)
+    assert not any(touched)
+    gap = np.linalg.norm(track.qpos[:, :3] - rock.centre, axis=1) - rock.radius
+    assert gap.min() > 0.45 + 0.3  # well clear of a body that reaches 0.4 m from its middle
+    above = track.qpos[:, 2][np.linalg.norm(track.qpos[:, :2], axis=1) < 1.5]
+    assert above.min() > 1.8 + drone.STANDING_HEIGHT + 0.3
+    assert np.linalg.norm(track.qpos[-1, :2] - (7.0, 0.0)) < 0.1
+    assert np.sqrt(np.mean(track.cross_track((start, 0.0), (7.0, 0.0)) ** 2)) < 0.15
 
 
 def test_yaw_stays_where_it_was(flight):

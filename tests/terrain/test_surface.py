@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from moonteam.physics.scene import build_scene
-from moonteam.terrain.site import Site, make_site
+from moonteam.terrain.site import OVERHANG, Boulder, Site, make_site
 from moonteam.terrain.surface import Surface
 
 
@@ -76,3 +76,17 @@ def test_any_batch_shape_and_jit():
     assert jax.jit(Surface.height)(surface, xy).shape == (2, 3)
     assert surface.normal(xy).shape == (2, 3, 3)
     assert surface.plane(xy[0, 0], 0.3)[1].shape == (3,)
+
+
+def test_tops_are_the_ground_and_the_boulders_on_it():
+    rock = Boulder(np.array([1.0, -1.0, 0.2]), 0.5, np.zeros((0, 3)))
+    heights = np.full((41, 41), 0.1, np.float32)
+    surface = Site("one", 0, heights, 0.25, (rock,)).surface
+    reach = rock.reach(0.1) + OVERHANG
+    angle = np.linspace(0, 2 * np.pi, 16)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for share, height in ((0.0, 0.7), (0.3, 0.7), (rock.reach(0.1) + 0.2, 0.7), (2 * reach, 0.1)):
+        tops = surface.top(jnp.asarray(rock.centre[:2] + share * ring, jnp.float32))
+        assert np.allclose(tops, height, atol=1e-5)
+    assert float(surface.height(jnp.array([1.0, -1.0]))) == pytest.approx(0.1)
+    assert float(Surface(jnp.asarray(heights), 0.25).top(jnp.zeros(2))) == pytest.approx(0.1)

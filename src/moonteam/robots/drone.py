@@ -1,4 +1,4 @@
-"""The drone: a thruster hopper that flies at a constant height above the ground.
+"""The drone: a thruster hopper that flies at a constant height above ground and boulders.
 
 There is no air to push against, so four fixed thrusters do everything: their sum carries the
 weight, their differences roll and pitch, and their lean (alternately left and right about the
@@ -16,16 +16,17 @@ from jax import Array
 
 from moonteam.paths import assets
 from moonteam.robots.base import GRAVITY, Command, RobotKind, Telemetry, quat_matrix
-from moonteam.robots.path import Path, braking_speed, measure, start_path, update_path
+from moonteam.robots.path import Offset, Path, braking_speed, measure, start_path, update_path
 from moonteam.terrain.surface import Surface
 
-CRUISE_HEIGHT = 1.5  # m above the highest ground within LOOK_AHEAD
+CRUISE_HEIGHT = 1.5  # m above the highest ground or boulder within LOOK_AHEAD and NEAR
 STANDING_HEIGHT = 0.30  # m, base above the feet
 CRUISE_SPEED = 2.0  # m/s
 SPECIFIC_IMPULSE = 220.0  # s, a hydrazine monopropellant
 EXHAUST_SPEED = SPECIFIC_IMPULSE * 9.80665  # m/s
 
 LOOK_AHEAD = (0.0, 0.4, 0.8, 1.2, 1.6)  # s of flight at the present velocity
+NEAR = (0.6, 1.2)  # m along the way: it rises above what is there before it goes there
 CLIMB, SINK, TOUCHDOWN = 1.0, 0.7, 0.25  # m/s, vertical speed limits
 POSITION_GAIN, HEIGHT_GAIN = 0.9, 1.4  # 1/s
 VELOCITY_GAIN, CLIMB_GAIN = 2.0, 3.0  # 1/s
@@ -83,11 +84,16 @@ def control(
     path = update_path(state.path, qpos[:2], command)
     state = state._replace(path=path)
     landing = command.speed < 0.0
+    offset = measure(path, qpos[:2])
+    feet = qpos[2] - STANDING_HEIGHT
+    clearance = feet - surface.height(qpos[:2])
+    along = jnp.clip(offset.remaining, -jnp.array(NEAR), jnp.array(NEAR))
+    near = qpos[None, :2] + along[:, None] * offset.direction[None, :]
     ahead = qpos[None, :2] + jnp.array(LOOK_AHEAD)[:, None] * qvel[None, :2]
-    ground = surface.height(ahead)
-    clearance = qpos[2] - ground[0] - STANDING_HEIGHT
-    climb = jnp.max(ground) + CRUISE_HEIGHT - qpos[2]
-    wanted = _velocity(state, qpos, command, clearance, climb)
+    tops = surface.top(jnp.concatenate([near, ahead]))
+    room = feet - jnp.max(tops[:len(NEAR) + 1])  # LOOK_AHEAD begins with where it is
+    climb = jnp.max(tops) + CRUISE_HEIGHT - qpos[2]
+    wanted = _velocity(offset, command, clearance, room, climb)
     force = _acceleration(wanted, qvel[:3]) + jnp.array([0.0, 0.0, GRAVITY])
     thrust = _allocate(*_wrench(state, qpos, qvel, force * MASS))
     off = command.lost | (landing & (clearance < 0.03))
@@ -97,20 +103,21 @@ def control(
 
 
 def _velocity(
-    state: DroneState, qpos: Array, command: Command, clearance: Array, climb: Array
+    offset: Offset, command: Command, clearance: Array, room: Array, climb: Array
 ) -> Array:
     """Wanted velocity [3] m/s: along the path, back onto it, and to the right height.
 
-    `clearance` [] m is that of the feet, `climb` [] m the height missing to cruise.
+    `clearance` [] m of the feet from the ground, `room` [] m of the feet from the highest thing
+    here and NEAR, `climb` [] m missing to cruise.
     """
-    offset = measure(state.path, qpos[:2])
     landing = command.speed < 0.0
     # Holding and landing have no speed of their own; they need a little to keep their place.
     limit = jnp.where(command.speed > 0.0, jnp.minimum(command.speed, CRUISE_SPEED), 0.5)
     along = braking_speed(offset.remaining, limit, BRAKING, POSITION_GAIN)
     aside = jnp.clip(-POSITION_GAIN * offset.cross, -0.7, 0.7)
     left = jnp.array([-1.0, 1.0]) * offset.direction[::-1]
-    airborne = jnp.clip((clearance - 0.15) / 0.5, 0.0, 1.0)  # no sideways dash at take-off
+    # No sideways dash at take-off, nor towards what is still higher than the feet.
+    airborne = jnp.clip((room - 0.15) / 0.5, 0.0, 1.0)
     sideways = (along * offset.direction + aside * left) * jnp.where(landing, 1.0, airborne)
     up = jnp.clip(HEIGHT_GAIN * climb, -SINK, CLIMB)
     settle = -jnp.clip(0.6 * clearance, TOUCHDOWN, SINK)

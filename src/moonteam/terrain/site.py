@@ -30,6 +30,10 @@ SPACING = 0.25
 MARGIN = 4.0
 """Ground kept around a mission's map, m, so that a robot at the edge still stands on some."""
 
+OVERHANG = 0.6
+"""What flies keeps above a boulder's top from this far beside it on, m: its own half width and
+how far it strays.
+"""
 
 MAX_SAMPLES = 1_500_000
 """Largest number of elevation samples in a site."""
@@ -69,12 +73,25 @@ class Site:
 
     @functools.cached_property
     def surface(self) -> Surface:
-        """The ground as a function of (x, y), without boulders.
+        """The ground as a function of (x, y); boulders show in its `top` alone.
 
         Made outside any trace, since it is kept and would carry the first tracer along.
         """
         with jax.ensure_compile_time_eval():
-            return Surface(jnp.asarray(self.heights, jnp.float32), self.spacing)
+            ground = jnp.asarray(self.heights, jnp.float32)
+            return Surface(ground, self.spacing, jnp.asarray(self._tops(), jnp.float32))
+
+    def _tops(self) -> np.ndarray:
+        """Elevations [ny, nx] m, raised to a boulder's top as far as OVERHANG around it."""
+        tops = self.heights.astype(np.float32)
+        y, x = (self.spacing * (np.arange(n) - (n - 1) / 2) for n in tops.shape)
+        for boulder in self.boulders:
+            away = np.hypot(x[None, :] - boulder.centre[0], y[:, None] - boulder.centre[1])
+            high = float(boulder.centre[2]) + boulder.radius
+            ground = float(self.heights.flat[away.argmin()])
+            over = away <= boulder.reach(ground) + OVERHANG
+            tops[over] = np.maximum(tops[over], high)
+        return tops
 
     @property
     def extent(self) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The ground as a function: height, normal and slope at (x, y), jittable and batched.
+"""The ground as a function: height, normal, slope and boulder tops at (x, y), jittable, batched.
 
 Heights stand on a regular grid, row 0 in the south, column 0 in the west, the site's centre
 at the origin. Each square is split into two triangles along the diagonal from its south-west
@@ -23,6 +23,7 @@ class Surface:
 
     heights: Array  # [ny, nx] m, float32
     spacing: float = field(metadata={"static": True})  # m
+    tops: Array | None = None  # [ny, nx] m, ground or the boulder above it; None: no boulders
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -32,17 +33,23 @@ class Surface:
 
     def height(self, xy: Array) -> Array:
         """Ground height [...] m under points xy [..., 2] m; the border's height outside."""
-        corner, gradient, offset = self._triangle(xy)
+        corner, gradient, offset = self._triangle(self.heights, xy)
+        return corner + jnp.sum(gradient * offset, axis=-1)
+
+    def top(self, xy: Array) -> Array:
+        """Height [...] m that a flyer must stay above at xy [..., 2] m: ground and boulders."""
+        samples = self.heights if self.tops is None else self.tops
+        corner, gradient, offset = self._triangle(samples, xy)
         return corner + jnp.sum(gradient * offset, axis=-1)
 
     def normal(self, xy: Array) -> Array:
         """Unit normal [..., 3] of the triangle under xy [..., 2] m."""
-        _, gradient, _ = self._triangle(xy)
+        _, gradient, _ = self._triangle(self.heights, xy)
         return _normal(gradient)
 
     def slope(self, xy: Array) -> Array:
         """Slope [...] rad of the triangle under xy [..., 2] m."""
-        _, gradient, _ = self._triangle(xy)
+        _, gradient, _ = self._triangle(self.heights, xy)
         return jnp.arctan(jnp.linalg.norm(gradient, axis=-1))
 
     def plane(self, xy: Array, radius: Array | float) -> tuple[Array, Array]:
@@ -58,11 +65,11 @@ class Surface:
         gradient = around @ (ring / jnp.sum(ring[:, 0] ** 2))
         return (jnp.sum(around, axis=-1) + centre) / 9.0, _normal(gradient)
 
-    def _triangle(self, xy: Array) -> tuple[Array, Array, Array]:
-        """The triangle under a point: height [...] of the square's south-west corner,
-        gradient [..., 2] and the point's offset [..., 2] m from that corner.
+    def _triangle(self, samples: Array, xy: Array) -> tuple[Array, Array, Array]:
+        """The triangle of `samples` [ny, nx] under a point: height [...] of the square's
+        south-west corner, gradient [..., 2] and the point's offset [..., 2] m from that corner.
         """
-        ny, nx = self.heights.shape
+        ny, nx = samples.shape
         lead = (1,) * (xy.ndim - 1)
         half = jnp.array(self.extent, jnp.float32).reshape((*lead, 2))
         last = jnp.array([nx - 1, ny - 1], jnp.float32).reshape((*lead, 2))
@@ -71,8 +78,8 @@ class Surface:
         offset = at - cell
         fx, fy = offset[..., 0], offset[..., 1]
         x, y = cell[..., 0], cell[..., 1]
-        sw, se = self.heights[y, x], self.heights[y, x + 1]
-        nw, ne = self.heights[y + 1, x], self.heights[y + 1, x + 1]
+        sw, se = samples[y, x], samples[y, x + 1]
+        nw, ne = samples[y + 1, x], samples[y + 1, x + 1]
         south = fx >= fy  # the triangle south-west, south-east, north-east
         gx = jnp.where(south, se - sw, ne - nw)
         gy = jnp.where(south, ne - se, nw - sw)
