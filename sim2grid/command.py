@@ -186,12 +186,14 @@ def _drive(args: Args, prepared: Prepared, execution: Execution) -> dict[str, fl
 def _report(args: Args, prepared: Prepared, execution: Execution,
             plan: GridPlan) -> Report:
     from sim2grid.metrics import make_report
+    from sim2grid.slip import ground_height
 
     objective = None if args.planner == "policy" else args.objective
     return make_report(
         execution.record, prepared.mission, prepared.frame, prepared.bases,
         planner=args.planner, objective=objective, mode=args.mode, backend=args.backend,
-        seed=args.seed, grid_plan=plan)
+        seed=args.seed, grid_plan=plan,
+        height=ground_height(prepared.site.heights, prepared.site.spacing))
 
 
 def _film(args: Args, prepared: Prepared, execution: Execution) -> Film:

@@ -18,6 +18,7 @@ from moonteam.mission import Mission
 from moonteam.scenario import Cell
 from sim2grid.frames import Frame
 from sim2grid.record import Leg, Record
+from sim2grid.slip import Height, slip
 
 Floats = npt.NDArray[np.float64]
 
@@ -31,6 +32,7 @@ class Track:
     tilt: Floats  # [T] rad, between the body's up and the world's
     power: Floats  # [T] W
     propellant_rate: Floats  # [T] kg/s
+    qpos: Floats | None = None  # [T, 7 + joints] the robot's own, for its slip
 
 
 def tilt(quat: npt.NDArray) -> npt.NDArray:
@@ -46,8 +48,10 @@ def tracks(record: Record, bases: Sequence[int]) -> list[Track]:
     qpos = np.concatenate(record.qpos).astype(np.float64)
     power = np.concatenate(record.power).astype(np.float64)
     rate = np.concatenate(record.propellant).astype(np.float64)
-    return [Track(times, qpos[:, b:b + 3], tilt(qpos[:, b + 3:b + 7]), power[:, i], rate[:, i])
-            for i, b in enumerate(bases)]
+    ends = [min((c for c in bases if c > b), default=qpos.shape[1]) for b in bases]
+    return [Track(times, qpos[:, b:b + 3], tilt(qpos[:, b + 3:b + 7]), power[:, i], rate[:, i],
+                  qpos[:, b:end])
+            for i, (b, end) in enumerate(zip(bases, ends, strict=True))]
 
 
 def cross_track(track: Track, legs: Sequence[Leg]) -> Floats:
@@ -99,6 +103,7 @@ class RobotReport(msgspec.Struct, frozen=True):
     wrong_cells: int
     wrong_cell_rate: float | None
     max_tilt_deg: float
+    slip: float | None  # see sim2grid.slip; null for flyers
     falls: int
     stuck: int
     distance_m: float
@@ -153,7 +158,7 @@ def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]
 
 
 def robot_report(mission: Mission, robot: int, track: Track, record: Record,
-                 frame: Frame) -> RobotReport:
+                 frame: Frame, height: Height | None = None) -> RobotReport:
     """One robot's figures. Seconds per move are over moves that ended in arrival."""
     own = [leg for leg in record.legs if leg.robot == robot]
     sent = [leg for leg in own if leg.moving and leg.ended in ("arrived", "timeout")]
@@ -165,6 +170,7 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
     steps = np.diff(track.times)
     x, y = (int(v) for v in frame.cell(np.nan_to_num(track.xyz[-1, :2])))
     spec = mission.robots[robot]
+    slipped = None if track.qpos is None else slip(spec.kind, track.qpos, height)
     return RobotReport(
         name=spec.name, kind=spec.kind, skills=spec.skills, final_cell=(x, y),
         lost=loss.cause if loss else None, lost_s=_round(loss.time_s) if loss else None,
@@ -175,6 +181,7 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
         timeouts=sum(leg.ended == "timeout" for leg in sent), wrong_cells=wrong,
         wrong_cell_rate=_round(wrong / len(sent)) if sent else None,
         max_tilt_deg=_round(float(np.degrees(np.nanmax(track.tilt)))),
+        slip=_round(slipped) if slipped is not None else None,
         falls=int(loss is not None and loss.cause == "fallen"),
         stuck=int(loss is not None and loss.cause == "stuck"),
         distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
@@ -184,10 +191,10 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
 
 def make_report(record: Record, mission: Mission, frame: Frame, bases: Sequence[int], *,
                 planner: str, objective: str | None, mode: str, backend: str, seed: int,
-                grid_plan: GridPlan | None) -> Report:
-    """The whole report; `bases` as in `tracks`."""
+                grid_plan: GridPlan | None, height: Height | None = None) -> Report:
+    """The whole report; `bases` as in `tracks`, `height` as in `slip.slip`."""
     decisions = len(record.decisions)
-    robots = tuple(robot_report(mission, i, track, record, frame)
+    robots = tuple(robot_report(mission, i, track, record, frame, height)
                    for i, track in enumerate(tracks(record, bases)))
     inflation = None
     if record.success and grid_plan is not None and grid_plan.makespan:
