@@ -17,6 +17,8 @@ from moonteam.scenario import Cell
 
 KINDS = ("drone", "legged", "wheeled")
 Kind = Literal["drone", "legged", "wheeled"]
+WHAT = ("lost", "target", "slow", "silent", "impassable")
+"""Keys of an event, one of which says what happens."""
 
 
 class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,12 +54,36 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     name: str | None = None
 
 
+class Slow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """From now on a robot travels at `factor` (0.1 to 1) of its speed."""
+
+    robot: str
+    factor: float
+
+
+class Silent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Nothing reaches a robot and nothing is heard of it for so many `decisions`."""
+
+    robot: str
+    decisions: int
+
+
+class Impassable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The news that a kind of robot cannot cross a cell."""
+
+    kind: Kind
+    at: Cell
+
+
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Something that happens at decision `at_decision`: a robot is lost, a target appears."""
+    """Something that happens at decision `at_decision`; one of the other keys says what."""
 
     at_decision: int
     lost: str | None = None
     target: Target | None = None
+    slow: Slow | None = None
+    silent: Silent | None = None
+    impassable: Impassable | None = None
 
 
 class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -179,12 +205,34 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
     if event.at_decision < 1:
         raise InputError(source, f"{event.at_decision} is not allowed; at least 1",
                          f"{key}.at_decision")
-    if (event.lost is None) == (event.target is None):
-        raise InputError(source, "give one of lost and target", key)
-    if event.lost is not None and event.lost not in [r.name for r in mission.robots]:
-        raise InputError(source, f"no robot is named {event.lost!r}; robots: "
-                         + ", ".join(r.name for r in mission.robots), f"{key}.lost")
+    what = [name for name in WHAT if getattr(event, name) is not None]
+    if len(what) != 1:
+        raise InputError(source, f"give one of {', '.join(WHAT[:-1])} and {WHAT[-1]}", key)
+    key = f"{key}.{what[0]}"
+    if event.lost is not None:
+        _check_robot(mission, event.lost, source, key)
     if event.target is not None:
-        scenario.check_cell(event.target.at, mission.map.size,
-                            lambda p: InputError(source, p, f"{key}.target.at"))
-        _check_skills(mission, event.target, source, f"{key}.target.skills")
+        _check_cell(mission, event.target.at, source, f"{key}.at")
+        _check_skills(mission, event.target, source, f"{key}.skills")
+    if event.slow is not None:
+        _check_robot(mission, event.slow.robot, source, f"{key}.robot")
+        if not 0.1 <= event.slow.factor <= 1:
+            raise InputError(source, f"{event.slow.factor} is not allowed; 0.1 to 1",
+                             f"{key}.factor")
+    if event.silent is not None:
+        _check_robot(mission, event.silent.robot, source, f"{key}.robot")
+        if event.silent.decisions < 1:
+            raise InputError(source, f"{event.silent.decisions} is not allowed; at least 1",
+                             f"{key}.decisions")
+    if event.impassable is not None:
+        _check_cell(mission, event.impassable.at, source, f"{key}.at")
+
+
+def _check_robot(mission: Mission, name: str, source: object, key: str) -> None:
+    names = [robot.name for robot in mission.robots]
+    if name not in names:
+        raise InputError(source, f"no robot is named {name!r}; robots: {', '.join(names)}", key)
+
+
+def _check_cell(mission: Mission, cell: Cell, source: object, key: str) -> None:
+    scenario.check_cell(cell, mission.map.size, lambda problem: InputError(source, problem, key))
