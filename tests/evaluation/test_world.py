@@ -128,7 +128,7 @@ def small():
 
 
 def test_plain_argmax_is_what_the_planner_does_alone(policy, small):
-    tries = rollouts.run(policy, small, parse("plain-argmax"), 0.0, 1.0, 0, "")
+    tries = rollouts.run(policy, small, parse("plain-argmax"), 0.0, 0, "")
     alone = LearnedPlanner(policy, watch=False)
     for i, scenario in enumerate(small.scenarios):
         now = Snapshot.start(scenario)
@@ -144,21 +144,39 @@ def test_plain_argmax_is_what_the_planner_does_alone(policy, small):
 
 
 def test_the_watch_draws_where_argmax_circles(policy, small):
-    plain = rollouts.run(policy, small, parse("plain-argmax"), 0.0, 1.0, 0, "")
-    watched = rollouts.run(policy, small, parse("argmax"), 0.0, 1.0, 0, "")
+    plain = rollouts.run(policy, small, parse("plain-argmax"), 0.0, 0, "")
+    watched = rollouts.run(policy, small, parse("argmax"), 0.0, 0, "")
     assert plain.rescues.sum() == 0
     assert not plain.success.all()  # an untrained policy runs against walls
     assert (watched.rescues[~plain.success] > 0).all()
     assert watched.success.sum() > plain.success.sum()
 
 
-def test_tries_do_not_depend_on_their_batch(policy, small, monkeypatch):
-    whole = rollouts.run(policy, small, parse("best-of-3"), 0.0, 1.0, 5, "")
+def test_the_best_does_not_depend_on_the_pool(policy, small, monkeypatch):
+    prices = rollouts.price("moves")
+
+    def best(decode="best-of-3", **how):
+        tries = rollouts.run(policy, small, parse(decode), 0.0, 5, "", prices, **how)
+        choice = rollouts.best(tries, prices)
+        return [rollouts.picked(v, choice).tolist() for v in (
+            tries.success, tries.steps, tries.moves)]
+
+    whole, alone = best(), best(alone=True)
     monkeypatch.setattr(rollouts, "MOST_EPISODES", 5)
-    parts = rollouts.run(policy, small, parse("best-of-3"), 0.0, 1.0, 5, "")
-    assert whole.steps.tolist() == parts.steps.tolist()
-    assert whole.moves.tolist() == parts.moves.tolist()
-    assert len(set(map(tuple, whole.moves.T.tolist()))) == 3  # tries differ
+    assert best() == whole == alone
+    # More tries can only be better, whichever of them were given up.
+    many = best("best-of-9")
+    assert sum(many[0]) >= sum(whole[0])
+    assert all(m <= w for m, w, ok in zip(many[2], whole[2], whole[0], strict=True) if ok)
+
+
+def test_tries_differ_and_only_the_dear_are_given_up(policy, small):
+    free = rollouts.run(policy, small, parse("best-of-4@1.5"), 0.0, 5, "", (0.0, 0.0))
+    assert len(set(map(tuple, free.moves.T.tolist()))) == 4
+    tight = rollouts.run(policy, small, parse("best-of-4@1.5"), 0.0, 5, "")
+    lost = free.success & ~tight.success
+    fastest = np.where(free.success, free.steps, 999).min(axis=1, keepdims=True)
+    assert (free.steps > fastest)[lost].all()
 
 
 def test_best_of_prefers_success_then_the_objective():
@@ -167,13 +185,22 @@ def test_best_of_prefers_success_then_the_objective():
         steps=np.array([[9, 20, 21], [128, 128, 128]]),
         moves=np.array([[1, 40, 30], [7, 5, 6]]), rescues=np.zeros((2, 3), np.int64),
         seconds=0.0, compiling=0.0)
-    assert rollouts.best(tries, "makespan", 1.0, 0.05).tolist() == [1, 1]
-    assert rollouts.best(tries, "moves", 1.0, 0.05).tolist() == [2, 1]
-    assert rollouts.best(tries, "weighted", 1.0, 1.0).tolist() == [2, 1]
+    assert rollouts.best(tries, rollouts.price("makespan")).tolist() == [1, 1]
+    assert rollouts.best(tries, rollouts.price("moves")).tolist() == [2, 1]
+    assert rollouts.best(tries, rollouts.price("weighted", 1.0, 1.0)).tolist() == [2, 1]
 
 
 @pytest.mark.parametrize("text", ["best-of-0", "best-of-", "best-of-x", "best-of--3", "beam",
-                                  "best-of-1000000", ""])
+                                  "best-of-1000000", "", "sample@0", "sample@hot",
+                                  "plain-argmax@2", "argmax-sum"])
 def test_unknown_decodings_are_refused(text):
     with pytest.raises(InputError, match="--decode"):
         parse(text)
+
+
+def test_temperature_and_symmetry_are_part_of_the_decoding():
+    assert parse("sample@0.5").temperature == 0.5
+    assert parse("best-of-16-sym@0.50").name == "best-of-16-sym@0.5"
+    assert parse("argmax@1.0") == parse("argmax")
+    assert parse("argmax-sym").watch
+    assert parse("argmax-sym").symmetric

@@ -48,9 +48,10 @@ class Args:
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()
     """argmax, plain-argmax (without the deadlock watch), sample, best-of-K such as best-of-16;
-    again for more rows. Default: argmax."""
-    temperature: float = 1.0
-    """Of sampling: below 1 is bolder, above 1 more random."""
+    @T sets the temperature of drawing (best-of-16@0.5), -sym averages over the turns and
+    reflections of the map (argmax-sym); again for more rows. Default: argmax."""
+    alone: bool = False
+    """Policies play one scenario at a time, not in batches: the planning time of a mission."""
     alpha: float = 1.0
     """Weight of the makespan in the objective weighted."""
     beta: float = 0.05
@@ -117,8 +118,47 @@ def _scenarios(args: Args) -> tuple[list[Scenario], str]:
                    f"{len(found)} scenarios")
 
 
-def finished(document: dict) -> int:
-    """The exit code of a report, and a word on standard error if it was cut short."""
+def options_of(args: Any) -> Any:
+    """What the options shared by `evaluate grid` and `replanning` ask for, with its files found."""
+    from moonteam.evaluation.contenders import Options
+
+    return Options(
+        planners=args.planner or ("exact",), objectives=args.objective or ("makespan",),
+        policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
+        preferences=args.preference, decodes=args.decode or ("argmax",),
+        alpha=getattr(args, "alpha", 1.0), beta=getattr(args, "beta", 0.05),
+        time_limit=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False))
+
+
+def repeated(args: Any, name: str, more: dict[str, object]) -> str:
+    """The command line of a report, from the same options and `more`."""
+    changed = {key: value for key in ("alpha", "beta") if key in args.__dataclass_fields__
+               and (value := getattr(args, key)) != args.__dataclass_fields__[key].default}
+    return command_line(name, [args.set] if args.set else [], {
+        **({} if args.set else drawn(args)), "planner": args.planner or ("exact",),
+        "objective": args.objective, "policy": args.policy, "preference": args.preference,
+        "decode": args.decode, **changed, **more, "time-limit": args.time_limit,
+        "seed": args.seed or None, "limit": args.limit}) + (
+            " --alone" if getattr(args, "alone", False) else "")
+
+
+def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
+    """Saves and prints a report as the options wish; returns the exit code.
+
+    `form` is the module that made it, with its COLUMNS, PAGE and PANELS; an interrupted report
+    says on standard error what it lacks.
+    """
+    from moonteam.evaluation import figures, report
+
+    if args.out:
+        report.save(args.out, document, form.PAGE)
+        figures.bars(args.out / picture, document, form.PANELS)
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(report.markdown(document, form.PAGE))
+    else:
+        report.show(document, form.COLUMNS)
     if "interrupted" not in document:
         return 0
     left = ", ".join(document["interrupted"])
@@ -129,31 +169,10 @@ def finished(document: dict) -> int:
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.evaluation import figures, grid, report
-    from moonteam.evaluation.contenders import Options, contenders
+    from moonteam.evaluation import grid
+    from moonteam.evaluation.contenders import contenders
 
     found, title = _scenarios(args)
-    options = Options(
-        planners=args.planner or ("exact",), objectives=args.objective or ("makespan",),
-        policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
-        preferences=args.preference, decodes=args.decode or ("argmax",),
-        temperature=args.temperature, alpha=args.alpha, beta=args.beta,
-        time_limit=args.time_limit, seed=args.seed)
-    rows = contenders(options)
-    command = command_line("evaluate grid", [args.set] if args.set else [], {
-        **({} if args.set else drawn(args)),
-        "planner": options.planners, "objective": args.objective, "policy": args.policy,
-        "preference": args.preference, "decode": args.decode,
-        "temperature": args.temperature if args.temperature != 1.0 else None,
-        "time-limit": args.time_limit, "seed": args.seed or None, "limit": args.limit})
-    document = grid.evaluate(found, rows, args.seed, title, command)
-    if args.out:
-        report.save(args.out, document, grid.PAGE)
-        figures.bars(args.out / "gaps.png", document, grid.PANELS)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.markdown(document, grid.PAGE))
-    else:
-        report.show(document, grid.COLUMNS)
-    return finished(document)
+    rows = contenders(options_of(args))
+    document = grid.evaluate(found, rows, args.seed, title, repeated(args, "evaluate grid", {}))
+    return deliver(args, document, grid, "gaps.png")

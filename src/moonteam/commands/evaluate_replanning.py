@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from moonteam import compilation, files, paths
-from moonteam.commands.evaluate_grid import Many, command_line, drawn, finished, load_set
+from moonteam import compilation
+from moonteam.commands.evaluate_grid import Many, deliver, load_set, options_of, repeated
 from moonteam.errors import InputError
 from moonteam.scenario import Scenario
 
@@ -39,10 +39,8 @@ class Args:
     preference: Many[tuple[float, ...]] = ()
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()
-    """argmax, plain-argmax (without the deadlock watch) or sample; again for more rows.
-    Default: argmax."""
-    temperature: float = 1.0
-    """Of sampling: below 1 is bolder, above 1 more random."""
+    """argmax, plain-argmax (without the deadlock watch) or sample, with -sym and @T as in
+    `evaluate grid`; again for more rows. Default: argmax."""
     new: int = 5
     """How many of a scenario's targets appear later."""
     count: int = 200
@@ -87,34 +85,15 @@ def _scenarios(args: Args) -> tuple[list[Scenario], str]:
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.evaluation import figures, replanning, report
-    from moonteam.evaluation.contenders import Options, contenders
+    from moonteam.evaluation import replanning
+    from moonteam.evaluation.contenders import contenders
 
     if any(text.startswith("best-of") for text in args.decode):
         raise InputError("--decode", "best-of-K looks ahead, which nobody can where targets "
                          "appear unannounced; argmax or sample")
     found, title = _scenarios(args)
-    options = Options(
-        planners=args.planner or ("exact",), objectives=args.objective or ("makespan",),
-        policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
-        preferences=args.preference, decodes=args.decode or ("argmax",),
-        temperature=args.temperature, time_limit=args.time_limit, seed=args.seed)
-    rows = contenders(options)
-    command = command_line("evaluate replanning", [args.set] if args.set else [], {
-        "planner": options.planners, "objective": args.objective, "policy": args.policy,
-        "preference": args.preference, "decode": args.decode,
-        "temperature": args.temperature if args.temperature != 1.0 else None,
-        "new": args.new if args.new != 5 else None,
-        **({} if args.set else drawn(args)), "seed": args.seed or None,
-        "time-limit": args.time_limit, "limit": args.limit})
-    document = replanning.evaluate(found, rows, args.new, args.seed, title, command)
-    if args.out:
-        report.save(args.out, document, replanning.PAGE)
-        figures.bars(args.out / "replanning.png", document, replanning.PANELS)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.markdown(document, replanning.PAGE))
-    else:
-        report.show(document, replanning.COLUMNS)
-    return finished(document)
+    rows = contenders(options_of(args))
+    new = args.new if args.new != 5 else None
+    document = replanning.evaluate(found, rows, args.new, args.seed, title,
+                                   repeated(args, "evaluate replanning", {"new": new}))
+    return deliver(args, document, replanning, "replanning.png")

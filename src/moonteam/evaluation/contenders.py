@@ -40,11 +40,11 @@ class Options:
     policies: Sequence[Path] = ()
     preferences: Sequence[float] = ()
     decodes: Sequence[str] = ("argmax",)
-    temperature: float = 1.0
     alpha: float = 1.0
     beta: float = 0.05
     time_limit: float | None = None
     seed: int = 0
+    alone: bool = False
 
 
 class WholePlanner(Protocol):
@@ -190,15 +190,19 @@ class Learned:
     def run(self, world: World) -> Outcomes:
         """See `Contender`."""
         options = self.options
-        tries = rollouts.run(self.policy, world, self.decode, self.preference,
-                             options.temperature, options.seed, self.name)
-        choice = rollouts.best(tries, self.objective, options.alpha, options.beta)
+        prices = rollouts.price(self.objective, options.alpha, options.beta)
+        tries = rollouts.run(self.policy, world, self.decode, self.preference, options.seed,
+                             self.name, prices, options.alone)
+        choice = rollouts.best(tries, prices)
         success, steps, moves, rescues = (rollouts.picked(v, choice) for v in (
             tries.success, tries.steps, tries.moves, tries.rescues))
-        note = ""
+        note = ("planning time with one scenario at a time" if options.alone else
+                "planning time is the whole set's, played in batches, over its scenarios; "
+                "--alone plays one at a time")
         if self.decode.watch:
             note = (f"the deadlock watch drew {rescues.sum()} of {steps.sum()} decisions, in "
-                    f"{(rescues > 0).sum()} of {len(world)} scenarios; plain-argmax goes without")
+                    f"{(rescues > 0).sum()} of {len(world)} scenarios; plain-argmax goes without; "
+                    + note)
         return Outcomes(self.name, success, steps, moves, tries.seconds, tries.compiling, note)
 
 
@@ -239,8 +243,6 @@ def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contend
     """The rows of every policy file, preference and decoding."""
     if not options.policies:
         raise InputError("--policy", "a policy file is needed with --planner policy")
-    if options.temperature <= 0 or not np.isfinite(options.temperature):
-        raise InputError("--temperature", f"{options.temperature} is not allowed; above 0")
     for preference in options.preferences:
         if not 0.0 <= preference <= 1.0:
             raise InputError("--preference", f"{preference} is not allowed; 0 (time) to 1 (effort)")
@@ -252,10 +254,10 @@ def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contend
         given = options.preferences if isinstance(policy.brain, EntityBrain) else ()
         for preference in given or (0.0,):
             for decode in decodes:
+                if decode.symmetric:
+                    policy.symmetrised()
                 for objective in objectives if decode.rollouts > 1 else objectives[:1]:
                     words = [decode.name]
-                    if decode.sample and options.temperature != 1.0:
-                        words.append(f"temperature {options.temperature:g}")
                     if decode.rollouts > 1 and len(objectives) > 1:
                         words.append(objective)
                     if given:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from moonteam.errors import InputError
 
 MOST_ROLLOUTS = 4096
-ALLOWED = "argmax, plain-argmax, sample, best-of-K (such as best-of-16)"
+ALLOWED = ("argmax, plain-argmax, sample or best-of-K (such as best-of-16); -sym after it "
+           "averages over symmetries, @T sets the temperature (such as sample@0.5)")
+
+_FORM = re.compile(r"(?P<how>argmax|plain-argmax|sample|best-of-(?P<count>[^@]*?))"
+                   r"(?P<sym>-sym)?(@(?P<heat>.*))?")
 
 
 @dataclass(frozen=True)
@@ -17,24 +22,45 @@ class Decode:
     `sample` draws the actions; `watch` takes the likeliest but draws where the team comes back
     to a joint state without having solved a target in between, as
     `planners.learned.LearnedPlanner` does; of `rollouts` tries a scenario the best counts.
+    `symmetric` averages the probabilities over the turns and reflections of the map.
     """
 
     name: str
     sample: bool = False
     watch: bool = False
     rollouts: int = 1
+    symmetric: bool = False
+    temperature: float = 1.0
 
 
 def parse(text: str) -> Decode:
-    """`argmax`, `plain-argmax`, `sample` or `best-of-K`. Raises InputError."""
-    simple = {"argmax": Decode(text, watch=True), "plain-argmax": Decode(text),
-              "sample": Decode(text, sample=True)}
-    if text in simple:
-        return simple[text]
-    head, _, count = text.rpartition("-")
-    if head == "best-of":
-        if count.isascii() and count.isdigit() and 1 <= int(count) <= MOST_ROLLOUTS:
-            return Decode(f"best-of-{int(count)}", sample=True, rollouts=int(count))
-        raise InputError("--decode", f"best-of-K needs a whole number K from 1 to "
-                         f"{MOST_ROLLOUTS}, not {count!r}")
-    raise InputError("--decode", f"{text!r} is not one of {ALLOWED}")
+    """The decoding that a user names, see `ALLOWED`. Raises InputError."""
+    found = _FORM.fullmatch(text)
+    if found is None:
+        raise InputError("--decode", f"{text!r} is not one of {ALLOWED}")
+    how, count = found["how"], found["count"]
+    rollouts = 1
+    if count is not None:
+        if not (count.isascii() and count.isdigit() and 1 <= int(count) <= MOST_ROLLOUTS):
+            raise InputError("--decode", f"best-of-K needs a whole number K from 1 to "
+                             f"{MOST_ROLLOUTS}, not {count!r}")
+        rollouts = int(count)
+        how = f"best-of-{rollouts}"
+    if how == "plain-argmax" and found["heat"] is not None:
+        raise InputError("--decode", f"{text!r}: plain-argmax never draws, it has no temperature")
+    heat = _temperature(text, found["heat"])
+    name = how + (found["sym"] or "") + ("" if heat == 1.0 else f"@{heat:g}")
+    return Decode(name, count is not None or how == "sample", how == "argmax", rollouts,
+                  found["sym"] is not None, heat)
+
+
+def _temperature(text: str, heat: str | None) -> float:
+    if heat is None:
+        return 1.0
+    try:
+        value = float(heat)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e6:
+        raise InputError("--decode", f"{text!r}: a temperature above 0 follows the @")
+    return value

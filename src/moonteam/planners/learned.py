@@ -1,6 +1,7 @@
 """A trained policy as a planner: decides each joint action, or rolls out whole plans.
 
-Legend: N agents, M targets, K rollouts, W columns, H rows (of the map) or units (of memory).
+Legend: E episodes of a batch, N agents, M targets, K rollouts, W columns, H rows (of the map)
+or units (of memory), L kinds of robots.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from moonteam.errors import InputError
 from moonteam.grid import env
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
-from moonteam.grid.travel import problem_fields
 from moonteam.grid.types import Problem, State
 from moonteam.planners import simulate
 from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
 from moonteam.planners.routes import Certificate, infeasible, plan_of_trace
-from moonteam.policies import checkpoint, entity, recurrent
+from moonteam.planners.travel import UNREACHABLE, distance_fields
+from moonteam.policies import checkpoint, entity, recurrent, symmetry
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.recurrent import RecurrentSpec
 
@@ -34,15 +35,28 @@ Decode = Literal["argmax", "sample"]
 
 
 class Brain(Protocol):
-    """A network as it decides for one team; hashable, for it is static under jit."""
+    """A network as it decides for a batch of episodes; hashable, for it is static under jit."""
 
-    def begin(self, num_agents: int) -> Any:
-        """Empty memory."""
+    @property
+    def travels(self) -> bool:
+        """Whether it reads travel fields where the ground is blocked."""
         ...
 
-    def logits(self, params: Any, memory: Any, state: State, horizon: Array,
-               preference: Array) -> tuple[Any, Array]:
-        """(memory, [N, 5] logits) at a moment."""
+    def slots(self, num_targets: int) -> int:
+        """Target slots that it likes best; sizes between them need no compiling of their own."""
+        ...
+
+    def begin(self, episodes: int, num_agents: int) -> Any:
+        """Empty memory; every array in it begins with the axis E."""
+        ...
+
+    def logits(self, params: Any, memory: Any, states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[Any, Array]:
+        """(memory, [E, N, 5] logits) at a moment of each episode.
+
+        `fields` [E, L, M, H, W] are the steps to each target as in `grid.travel`, None on open
+        maps; `horizon` and `preference` are [E].
+        """
         ...
 
     def misfit(self, snapshot: Snapshot) -> str:
@@ -55,21 +69,30 @@ class RecurrentBrain:
     """The paper's network: one team size, one number of targets, one map."""
 
     spec: RecurrentSpec
+    travels = False
 
-    def begin(self, num_agents: int) -> Array:
-        """[N, H] zeros."""
-        return recurrent.zeros(self.spec, num_agents)
+    def slots(self, num_targets: int) -> int:
+        """Exactly those there are."""
+        return num_targets
 
-    def logits(self, params: Any, memory: Array, state: State, horizon: Array,
-               preference: Array) -> tuple[Array, Array]:
-        """See `Brain`; horizon and preference are not among what it observes."""
-        del horizon, preference
-        obs = observe(EnvConfig(normalize_positions=self.spec.normalise), state)  # [N, D]
-        never = jnp.zeros((1, obs.shape[0]), bool)
+    def begin(self, episodes: int, num_agents: int) -> Array:
+        """[E, N, H] zeros."""
+        return recurrent.zeros(self.spec, episodes * num_agents).reshape(
+            episodes, num_agents, -1)
+
+    def logits(self, params: Any, memory: Array, states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[Array, Array]:
+        """See `Brain`; fields, horizon and preference are not among what it observes."""
+        del fields, horizon, preference
+        config = EnvConfig(normalize_positions=self.spec.normalise)
+        obs = jax.vmap(partial(observe, config))(states)  # [E, N, D]
+        rows = obs.reshape(1, -1, obs.shape[-1])
+        never = jnp.zeros(rows.shape[:2], bool)
         net = recurrent.actor(self.spec)
-        result: Any = net.apply({"params": params["actor"]}, memory, obs[None], never)
-        memory, out = result
-        return memory, out[0]
+        before = memory.reshape(rows.shape[1], -1)
+        result: Any = net.apply({"params": params["actor"]}, before, rows, never)
+        after, out = result
+        return after.reshape(memory.shape), out[0].reshape(*obs.shape[:2], -1)
 
     def misfit(self, snapshot: Snapshot) -> str:
         """See `Brain`."""
@@ -93,23 +116,30 @@ class EntityBrain:
     """The network for any team, any targets, any ground; it has no memory."""
 
     spec: EntitySpec
+    symmetric: bool = False
+    """Average the probabilities over the 8 turns and reflections of the map."""
+    travels = True
 
-    def begin(self, num_agents: int) -> tuple[()]:
+    def slots(self, num_targets: int) -> int:
+        """The next multiple of four; padding changes nothing."""
+        return -(-num_targets // 4) * 4
+
+    def begin(self, episodes: int, num_agents: int) -> tuple[()]:
         """Nothing."""
-        del num_agents
+        del episodes, num_agents
         return ()
 
-    def logits(self, params: Any, memory: tuple[()], state: State, horizon: Array,
-               preference: Array) -> tuple[tuple[()], Array]:
+    def logits(self, params: Any, memory: tuple[()], states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[tuple[()], Array]:
         """See `Brain`; what is returned are log-probabilities."""
-        fields = problem_fields(state.problem)
 
         def look(state: State, horizon: Any, preference: Array, fields: Array | None) -> Any:
             return entity.look(state, horizon, preference, fields)
 
-        batch = jax.tree.map(lambda x: x[None], (state, horizon, preference, fields))
-        view = jax.vmap(look)(*batch)
-        return memory, entity.decide(params, self.spec, view).log_probs[0]
+        view = jax.vmap(look)(states, horizon, preference, fields)
+        if self.symmetric:
+            return memory, symmetry.averaged(params, self.spec, view)
+        return memory, entity.decide(params, self.spec, view).log_probs
 
     def misfit(self, snapshot: Snapshot) -> str:
         """See `Brain`: everything fits."""
@@ -153,6 +183,16 @@ class Policy:
         if problem:
             raise InputError(self.path, problem)
 
+    def symmetrised(self) -> Policy:
+        """The policy that averages over turns and reflections of the map; 8 times the work.
+
+        Raises InputError if its network sees absolute positions.
+        """
+        if not isinstance(self.brain, EntityBrain):
+            raise InputError(self.path, "is not of kind entity: it cannot be averaged over "
+                             "symmetries")
+        return replace(self, brain=replace(self.brain, symmetric=True))
+
 
 class LearnedPlanner:
     """A policy asked at each decision; keeps its memory between the decisions of a mission.
@@ -163,11 +203,12 @@ class LearnedPlanner:
       temperature: logits are divided by it when drawing.
       watch: argmax can circle for ever. With the watch on, when a joint state (cells and
         solved targets) comes back without a target solved in between, that decision is drawn
-        instead, at a temperature of 1 for the first return, 2 for the second and so on.
+        instead, at `temperature` for the first return, twice that for the second and so on.
       preference: 0 time .. 1 effort, for policies that were trained with it.
 
     A lost robot stays and is observed as absent. Where the map has blocked cells, moves that
-    would be turned back are never chosen.
+    would be turned back are never chosen; travel times over it are searched when the map or
+    the targets change, not at each decision.
     """
 
     name = "policy"
@@ -178,7 +219,7 @@ class LearnedPlanner:
             raise InputError("temperature", f"{temperature} is not allowed; above 0")
         self.policy, self.decode, self.temperature = policy, decode, temperature
         self.watch, self.preference = watch, preference
-        self._begin(0, 0)
+        self._begin(0)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], decode: Decode = "argmax",
@@ -187,34 +228,49 @@ class LearnedPlanner:
         """From a policy file. Raises InputError."""
         return cls(Policy.load(path), decode, temperature, watch, preference)
 
-    def _begin(self, num_agents: int, seed: int) -> None:
-        self._memory = self.policy.brain.begin(num_agents)
-        self._key, self._decisions = jax.random.key(seed), 0
+    def _begin(self, seed: int) -> None:
+        self._memory: Any = None
+        self._seed, self._decisions = seed, 0
         self._seen: dict[bytes, int] = {}
         self._solved = b""
+        self._ground: tuple[bytes, Any] = (b"", None)
         self.rescues = 0
 
     def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
         """Empties the memory. Raises InputError if the policy cannot serve this mission."""
         self.policy.check(snapshot)
-        self._begin(len(snapshot.cells), seed)
+        self._begin(seed)
 
     def act(self, snapshot: Snapshot) -> IntArray:
         """Joint action [N]. Raises InputError if the mission has grown out of the policy."""
         self.policy.check(snapshot)
-        if self._decisions == 0 and jax.tree.leaves(self._memory):
-            self._memory = self.policy.brain.begin(len(snapshot.cells))
+        brain = self.policy.brain
+        if self._memory is None:
+            self._memory = brain.begin(1, len(snapshot.cells))
         returns = self._returns(snapshot)
-        heat = self.temperature if self.decode == "sample" else float(max(returns, 1))
-        key = jax.random.fold_in(self._key, self._decisions)
-        self._memory, likeliest, drawn = _decide(
-            self.policy.brain, self.policy.params, self._memory, state_of(snapshot), key,
-            np.float32(heat), np.int32(snapshot.max_steps), np.float32(self.preference))
-        self._decisions += 1
+        self._memory, logits = _decide(
+            brain, self.policy.params, self._memory, self._state(snapshot), self._ground[1],
+            np.int32(snapshot.max_steps), np.float32(self.preference))
+        logits = np.asarray(logits)
         rescue = self.decode == "argmax" and self.watch and returns > 0
         self.rescues += rescue
-        chosen = np.asarray(drawn if rescue or self.decode == "sample" else likeliest)
-        return np.where(snapshot.agent_mask, chosen, simulate.STAY).astype(np.int32)
+        if rescue or self.decode == "sample":
+            heat = self.temperature * (returns if rescue else 1)
+            chance = np.random.default_rng([self._seed, self._decisions])
+            logits = logits / heat + chance.gumbel(size=logits.shape)
+        self._decisions += 1
+        return np.where(snapshot.agent_mask, logits.argmax(-1), simulate.STAY).astype(np.int32)
+
+    def _state(self, snapshot: Snapshot) -> State:
+        """The snapshot in the slots of the network; searches travel times if they are new."""
+        slots = self.policy.brain.slots(len(snapshot.solved))
+        if snapshot.passable is not None and self.policy.brain.travels:
+            posed = snapshot.target_cells.tobytes() + snapshot.passable.tobytes()
+            if posed != self._ground[0]:
+                self._ground = (posed, jax.device_put(_fields(snapshot, slots)))
+        else:
+            self._ground = (b"", None)
+        return state_of(snapshot, slots)
 
     def _returns(self, snapshot: Snapshot) -> int:
         """How often this joint state was met before, since a target was last solved."""
@@ -233,8 +289,16 @@ class LearnedPlanner:
         while not now.solved.all() and now.step < now.max_steps:
             actions.append(self.act(now))
             now = simulate.step(now, actions[-1])
-        return _as_plan(snapshot, actions, "makespan", time.perf_counter() - begun,
+        return _as_plan(snapshot, np.array(actions), "makespan", time.perf_counter() - begun,
                         "the policy did not solve every target in time")
+
+
+_TIE = 2.0**-12
+"""Weight of the second wish, exact in float32 beside the first: ties fall to the other."""
+
+_PRICES: dict[Objective, tuple[float, float]] = {
+    "makespan": (1.0, _TIE), "moves": (_TIE, 1.0), "weighted": (1.0 + _TIE, 1.0)}
+"""Price of a step and of a move by which rollouts are compared."""
 
 
 def plan_best_of(policy: Policy, snapshot: Snapshot, count: int, seed: int = 0,
@@ -242,7 +306,8 @@ def plan_best_of(policy: Policy, snapshot: Snapshot, count: int, seed: int = 0,
                  preference: float = 0.0) -> Plan:
     """The best of `count` sampled rollouts in the grid env, all in one batched call.
 
-    Best by makespan, by moves, or by their sum for `weighted`; ties by the other.
+    Best by makespan, by moves, or by their sum for `weighted`; ties by the other. The call ends
+    as soon as no rollout still under way can become the best.
     Raises InputError if the policy cannot serve this mission.
     """
     begun = time.perf_counter()
@@ -250,93 +315,142 @@ def plan_best_of(policy: Policy, snapshot: Snapshot, count: int, seed: int = 0,
     if count < 1:
         raise InputError("best-of", f"{count} is not allowed; at least 1")
     snapshot = replace(snapshot, solved=simulate.holding(snapshot))
-    steps = max(snapshot.max_steps - snapshot.step, 1)
-    heat, horizon = np.float32(temperature), np.int32(snapshot.max_steps)
-    rolled = jax.device_get(_roll(
-        policy.brain, policy.params, state_of(snapshot), jax.random.key(seed), heat, horizon,
-        np.float32(preference), count, steps))
-    cost = {"makespan": rolled.makespan * 1e4 + rolled.moves,
-            "moves": rolled.moves * 1e4 + rolled.makespan,
-            "weighted": (rolled.makespan + rolled.moves) * 1e4 + rolled.makespan}[objective]
-    best = int(np.where(rolled.solved, cost, np.inf).argmin())
+    slots = policy.brain.slots(len(snapshot.solved))
+    travels = snapshot.passable is not None and policy.brain.travels
+    room = 1 << max(snapshot.max_steps - 1, 1).bit_length()
+    found = jax.device_get(_roll(
+        policy.brain, policy.params, state_of(snapshot, slots),
+        _fields(snapshot, slots) if travels else None, np.uint32(seed % 2**32),
+        np.float32(temperature), np.int32(snapshot.max_steps), np.float32(preference),
+        np.array(_PRICES[objective], np.float32), count, room))
     reason = f"none of {count} sampled rollouts solved every target in time"
-    actions = list(rolled.actions[:, best]) if rolled.solved[best] else []
+    actions = found.actions[:int(found.steps) if found.solved else 0].astype(np.int32)
     return _as_plan(snapshot, actions, objective, time.perf_counter() - begun, reason)
 
 
-def state_of(snapshot: Snapshot) -> State:
-    """The snapshot as a state of the grid env."""
-    put = jnp.asarray
+def state_of(snapshot: Snapshot, slots: int | None = None) -> State:
+    """The snapshot as a state of the grid env (NumPy arrays), padded to `slots` targets."""
+    count = len(snapshot.solved)
+    slots = slots or count
+
+    def pad(values: np.ndarray, fill: int = 0) -> Any:
+        if slots == count:
+            return values
+        out = np.full((slots, *values.shape[1:]), fill, values.dtype)
+        out[:count] = values
+        return out
+
+    whole: Any = np.asarray
+    real = np.zeros(slots, bool)
+    real[:count] = True
     problem = Problem(
-        size=put(snapshot.size, dtype=jnp.int32), agent_skills=put(snapshot.agent_skills),
-        agent_kinds=put(snapshot.agent_kinds), agent_mask=put(snapshot.agent_mask),
-        target_cells=put(snapshot.target_cells), target_skills=put(snapshot.target_skills),
-        target_and=put(snapshot.target_and), target_mask=jnp.ones(len(snapshot.solved), bool),
-        passable=None if snapshot.passable is None else put(snapshot.passable))
-    return State(problem, put(snapshot.cells), put(snapshot.solved),
-                 put(snapshot.step, dtype=jnp.int32))
+        size=whole(snapshot.size, np.int32), agent_skills=whole(snapshot.agent_skills, np.int32),
+        agent_kinds=whole(snapshot.agent_kinds, np.int32), agent_mask=whole(snapshot.agent_mask),
+        target_cells=pad(snapshot.target_cells), target_skills=pad(snapshot.target_skills),
+        target_and=pad(snapshot.target_and), target_mask=whole(real),
+        passable=None if snapshot.passable is None else whole(snapshot.passable))
+    return State(problem, whole(snapshot.cells, np.int32), pad(snapshot.solved, 1),
+                 whole(snapshot.step, np.int32))
 
 
-def _as_plan(snapshot: Snapshot, actions: list[IntArray], objective: Objective, seconds: float,
+def _fields(snapshot: Snapshot, slots: int) -> Any:
+    """[L, M, H, W] steps from every cell to each target, padded to `slots` targets."""
+    assert snapshot.passable is not None
+    found = distance_fields(snapshot.passable, snapshot.target_cells)
+    more = slots - found.shape[1]
+    return np.pad(found, ((0, 0), (0, more), (0, 0), (0, 0)), constant_values=UNREACHABLE)
+
+
+def _as_plan(snapshot: Snapshot, actions: IntArray, objective: Objective, seconds: float,
              reason: str) -> Plan:
-    trace = simulate.replay(snapshot, actions)
+    agents = len(snapshot.cells)
+    trace = simulate.replay_whole(snapshot, actions.reshape(-1, agents))
     if not trace.complete:
-        return infeasible("policy", objective, reason, seconds, len(snapshot.cells))
+        return infeasible("policy", objective, reason, seconds, agents)
     return plan_of_trace(snapshot, trace, Certificate("policy", objective, "feasible", None),
                          seconds)
 
 
-def masked(logits: Array, state: State) -> Array:
-    """Moves that blocked ground or the border would turn back are out, on maps with such."""
-    if state.problem.passable is None:
+def masked(logits: Array, states: State) -> Array:
+    """[E, N, 5] without moves that blocked ground or the border turns back, if ground is blocked.
+
+    On open maps a move against the border is the network's own affair, as in training.
+    """
+    if states.problem.passable is None:
         return logits
-    return jnp.where(env.available(state), logits, -1e9)
+    return jnp.where(jax.vmap(env.available)(states), logits, -1e9)
 
 
 @partial(jax.jit, static_argnames="brain")
-def _decide(brain: Brain, params: Any, memory: Any, state: State, key: Array, heat: Array,
-            horizon: Array, preference: Array) -> tuple[Any, Array, Array]:
-    """(memory, likeliest [N], drawn [N]) at one moment."""
-    memory, logits = brain.logits(params, memory, state, horizon, preference)
-    logits = masked(logits, state)
-    return memory, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits / heat)
+def _decide(brain: Brain, params: Any, memory: Any, state: State, fields: Array | None,
+            horizon: Array, preference: Array) -> tuple[Any, Array]:
+    """(memory, [N, 5] logits) at one moment."""
+    batch = jax.tree.map(lambda x: x[None], (state, fields, horizon, preference))
+    memory, logits = brain.logits(params, memory, *batch)
+    return memory, masked(logits, batch[0])[0]
 
 
 class _Rolled(NamedTuple):
-    actions: Array  # [T, K, N]
-    solved: Array  # [K] bool
-    makespan: Array  # [K] steps from the snapshot
-    moves: Array  # [K]
+    solved: Array  # [] bool, whether any rollout solved everything
+    steps: Array  # [] of the best
+    actions: Array  # [T, N] int8 of the best
 
 
-class _Walk(NamedTuple):
-    state: State
+class _Rollouts(NamedTuple):
+    step: Array  # []
+    states: State  # [K]
     memory: Any
-    steps: Array
-    moves: Array
+    steps: Array  # [K] int32, those that stand still are not counted
+    moves: Array  # [K] int32
+    actions: Array  # [T, K, N] int8
 
 
-@partial(jax.jit, static_argnames=("brain", "count", "steps"))
-def _roll(brain: Brain, params: Any, state: State, key: Array, heat: Array, horizon: Array,
-          preference: Array, count: int, steps: int) -> _Rolled:
-    """`count` sampled rollouts from one state, `steps` long; a finished one stands still."""
-    config = EnvConfig(max_steps=2**30)  # the caller's horizon is the length of the scan
+def _prices(rollouts: _Rollouts, price: Array) -> tuple[Array, Array, Array]:
+    """[K] solved, [K] price so far, [] the least price of those solved."""
+    solved = jnp.all(rollouts.states.solved, axis=1)
+    cost = price[0] * rollouts.steps + price[1] * rollouts.moves
+    return solved, cost, jnp.min(jnp.where(solved, cost, jnp.inf))
+
+
+@partial(jax.jit, static_argnames=("brain", "count", "room"))
+def _roll(brain: Brain, params: Any, state: State, fields: Array | None, seed: Array,
+          heat: Array, horizon: Array, preference: Array, price: Array, count: int,
+          room: int) -> _Rolled:
+    """The best of `count` sampled rollouts from one state; a finished one stands still.
+
+    Prices only grow, so the loop ends when those under way cost as much as the best finished.
+    """
+    config = EnvConfig(max_steps=2**30)  # the loop itself watches the horizon
     agents = state.cells.shape[0]
+    key = jax.random.key(seed)
 
-    def step(walk: _Walk, key: Array) -> tuple[_Walk, Array]:
-        memory, logits = brain.logits(params, walk.memory, walk.state, horizon, preference)
-        open_still = ~jnp.all(walk.state.solved)
-        drawn = jax.random.categorical(key, masked(logits, walk.state) / heat)
-        able = open_still & walk.state.problem.agent_mask
+    def many(value: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x[None], (count, *x.shape)), value)
+
+    ground, horizons, likings = many((fields, horizon, preference))
+
+    def going(rollouts: _Rollouts) -> Array:
+        solved, cost, best = _prices(rollouts, price)
+        return jnp.any(~solved & (cost < best)) & (rollouts.step < horizon - state.step)
+
+    def step(rollouts: _Rollouts) -> _Rollouts:
+        states = rollouts.states
+        memory, logits = brain.logits(params, rollouts.memory, states, ground, horizons, likings)
+        now = jax.random.fold_in(key, rollouts.step)
+        drawn = jax.random.categorical(now, masked(logits, states) / heat)
+        open_still = ~jnp.all(states.solved, axis=1)
+        able = open_still[:, None] & states.problem.agent_mask
         action = jnp.where(able, drawn, env.STAY)
-        after = env.step(config, walk.state, action).state
-        moves = walk.moves + jnp.sum(action != env.STAY)
-        return _Walk(after, memory, walk.steps + open_still, moves), action
+        after = jax.vmap(lambda s, a: env.step(config, s, a).state)(states, action)
+        moves = rollouts.moves + jnp.sum(action != env.STAY, axis=1)
+        kept = rollouts.actions.at[rollouts.step].set(action.astype(jnp.int8))
+        return _Rollouts(rollouts.step + 1, after, memory, rollouts.steps + open_still, moves,
+                         kept)
 
-    def one(key: Array) -> tuple[_Walk, Array]:
-        zero = jnp.zeros((), jnp.int32)
-        walk = _Walk(state, brain.begin(agents), zero, zero)
-        return jax.lax.scan(step, walk, jax.random.split(key, steps))
-
-    walk, actions = jax.vmap(one, out_axes=(0, 1))(jax.random.split(key, count))
-    return _Rolled(actions, jnp.all(walk.state.solved, axis=1), walk.steps, walk.moves)
+    none = jnp.zeros(count, jnp.int32)
+    start = _Rollouts(jnp.zeros((), jnp.int32), many(state), brain.begin(count, agents), none,
+                      none, jnp.zeros((room, count, agents), jnp.int8))
+    end = jax.lax.while_loop(going, step, start)
+    solved, cost, _ = _prices(end, price)
+    best = jnp.argmin(jnp.where(solved, cost, jnp.inf))
+    return _Rolled(solved[best], end.steps[best], end.actions[:, best])
