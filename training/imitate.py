@@ -41,9 +41,11 @@ from training.imitation import (
     begin,
     make_ground,
     on_ground,
+    spread_walk,
     views,
 )
 from training.loop import Stop, commit, describe_device, stop_on_signals
+from training.sharding import everywhere, use_all_cores
 
 CHECKPOINT_SECONDS = 60.0
 SCENARIOS = 256
@@ -104,6 +106,7 @@ def run(args: Args) -> int:
         raise InputError("--rounds", f"{rounds} is not allowed; at least 1")
     config = dataclasses.replace(PRESETS[args.preset], seed=args.seed, rounds=rounds)
     out = args.out or Path("runs") / f"{args.preset}-{args.seed}"
+    use_all_cores()
     say("moonteam: making grounds and held-out scenarios, compiling")
     work = Run(args.preset, config, out, args.resume)
     with stop_on_signals() as stop:
@@ -306,8 +309,8 @@ def _restore(dagger: Dagger, arrays: list[np.ndarray], counts: list[int]) -> Non
     walks = [w._replace(key=jax.random.key_data(w.key)) for w in dagger.walks]
     fixed, shape = jax.tree.flatten((dagger.learner, walks))
     learner, walks = jax.tree.unflatten(shape, [jnp.asarray(a) for a in arrays[:len(fixed)]])
-    dagger.learner = learner
-    dagger.walks = [w._replace(key=jax.random.wrap_key_data(w.key)) for w in walks]
+    dagger.learner = everywhere(learner)
+    dagger.walks = [spread_walk(w._replace(key=jax.random.wrap_key_data(w.key))) for w in walks]
     rest = arrays[len(fixed):]
     for memory, walk, count in zip(dagger.memories, dagger.walks, counts, strict=True):
         sample = Sample(walk.states, walk.place, walk.preference, walk.place)

@@ -25,9 +25,10 @@ from moonteam.errors import InputError
 from moonteam.grid import env, scenarios, travel
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.types import State
-from moonteam.planners.batch import solve_batch
+from moonteam.planners.batch import BatchPlans, solve_batch
 from moonteam.planners.exact import MAX_TARGETS
-from moonteam.policies.entity import Entities, EntitySpec, decide, look
+from moonteam.policies.entity import Decision, Entities, EntitySpec, decide, look
+from training.sharding import check_divides, everywhere, spread
 
 TIE_BREAK = 0.05
 """Weight that makespan and moves both keep at either end of the preference."""
@@ -184,6 +185,11 @@ def begin(family: Family, ground: Ground | None, key: Array, count: int) -> Walk
     return Walk(states, place, wish, jnp.where(jnp.arange(count) % 2 == 0, 1.0, 0.05), key)
 
 
+def spread_walk(walk: Walk) -> Walk:
+    """The environments shared out over the devices; the key on each of them."""
+    return Walk(*spread(walk[:-1]), everywhere(walk.key))
+
+
 def on_ground(ground: Ground | None, states: State, place: Array | np.ndarray) -> State:
     """The states with their maps."""
     if ground is None:
@@ -202,6 +208,23 @@ def views(family: Family, ground: Ground | None, states: State, place: Array | n
     return jax.vmap(lambda s, p, f: look(s, family.max_steps, p, f))(whole, preference, fields)
 
 
+def bare(states: State) -> State:
+    """The states without their maps, which `Ground` holds once."""
+    return replace(states, problem=replace(states.problem, passable=None))
+
+
+def renew(family: Family, ground: Ground | None, key: Array, walk: Walk, ended: Array) -> Walk:
+    """New episodes where they ended [E]."""
+    fresh = fresh_episodes(family, ground, key, ended.shape[0])
+
+    def swap(new: Array, old: Array) -> Array:
+        return jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    old = (walk.states, walk.place, walk.preference)
+    states, place, wish = jax.tree.map(swap, fresh, old)
+    return walk._replace(states=states, place=place, preference=wish)
+
+
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def walk_on(spec: EntitySpec, family: Family, steps: int, params: Any, ground: Ground | None,
             walk: Walk) -> Walk:
@@ -215,30 +238,30 @@ def walk_on(spec: EntitySpec, family: Family, steps: int, params: Any, ground: G
         whole = on_ground(ground, walk.states, walk.place)
         result = jax.vmap(lambda s, a: env.step(family.config, s, a))(whole, actions)
         ended = result.terminated | result.truncated
-        bare = replace(result.state, problem=replace(result.state.problem, passable=None))
-        fresh = fresh_episodes(family, ground, new_key, ended.shape[0])
-
-        def swap(new: Array, old: Array) -> Array:
-            return jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        states, place, wish = jax.tree.map(swap, fresh, (bare, walk.place, walk.preference))
-        return Walk(states, place, wish, walk.temperature, key), None
+        after = walk._replace(states=bare(result.state), key=key)
+        return renew(family, ground, new_key, after, ended), None
 
     return jax.lax.scan(step, walk, None, steps)[0]
+
+
+def solve(ground: Ground | None, states: State, place: np.ndarray, preference: np.ndarray,
+          threads: int | None = None) -> BatchPlans:
+    """Exact plans of states [B] (host arrays) at their preference between time and effort."""
+    problem = states.problem
+    passable = None if ground is None else np.asarray(ground.passable)[place]
+    return solve_batch(
+        states.cells, problem.agent_skills, problem.target_cells, problem.target_skills,
+        problem.target_and, solved=states.solved, agent_mask=problem.agent_mask, steps_left=1024,
+        agent_kinds=problem.agent_kinds if ground is not None else None, passable=passable,
+        objective="weighted", alpha=1.0 - preference + TIE_BREAK, beta=preference + TIE_BREAK,
+        threads=threads)
 
 
 def label(ground: Ground | None, walk: Walk, threads: int | None = None) -> Sample:
     """The walk's states with the oracle's next target for each agent."""
     states, place, wish = jax.device_get((walk.states, walk.place, walk.preference))
-    problem = states.problem
-    passable = None if ground is None else np.asarray(ground.passable)[place]
-    plans = solve_batch(
-        states.cells, problem.agent_skills, problem.target_cells, problem.target_skills,
-        problem.target_and, solved=states.solved, agent_mask=problem.agent_mask, steps_left=1024,
-        agent_kinds=problem.agent_kinds if ground is not None else None, passable=passable,
-        objective="weighted", alpha=1.0 - wish + TIE_BREAK, beta=wish + TIE_BREAK,
-        threads=threads)
-    num_targets = problem.target_skills.shape[1]
+    plans = solve(ground, states, place, wish, threads)
+    num_targets = states.problem.target_skills.shape[1]
     pointer = np.where(plans.next_target < 0, num_targets, plans.next_target).astype(np.int32)
     return Sample(states, place, wish, pointer)
 
@@ -247,12 +270,17 @@ def loss(params: Any, spec: EntitySpec, family: Family, ground: Ground | None,
          batch: Sample) -> Array:
     """Cross entropy of the pointer, and of the moves that lead where the label points."""
     view = views(family, ground, batch.states, batch.place, batch.preference)
-    decision = decide(params, spec, view)
-    pick = jax.nn.one_hot(batch.pointer, family.num_targets + 1)
+    return imitate_loss(decide(params, spec, view), view, batch.pointer)
+
+
+def imitate_loss(decision: Decision, view: Entities, pointer: Array | np.ndarray) -> Array:
+    """The loss of a batch; `pointer` [B, N] the planner's next targets, M for stay."""
+    num_targets = view.target_skills.shape[-1]
+    pick = jax.nn.one_hot(pointer, num_targets + 1)
     pointing = -jnp.sum(jax.nn.log_softmax(decision.pointer) * pick, axis=-1)
-    index = jnp.clip(batch.pointer, 0, family.num_targets - 1)[..., None, None]
+    index = jnp.clip(pointer, 0, num_targets - 1)[..., None, None]
     ways = jnp.take_along_axis(view.toward, index, axis=-2)[..., 0, :]
-    ways = ways & (batch.pointer < family.num_targets)[..., None]
+    ways = ways & (pointer < num_targets)[..., None]
     good = jnp.concatenate([ways, ~jnp.any(ways, axis=-1, keepdims=True)], axis=-1)
     moving = -jnp.log(jnp.sum(jnp.exp(decision.log_probs) * good, axis=-1))
     real = view.agent_mask
@@ -317,14 +345,17 @@ class Dagger:
         """Makes grounds, environments and fresh parameters from the config's seed."""
         from moonteam.policies import entity
 
+        check_divides("imitation", "num_envs", config.num_envs)
+        check_divides("imitation", "batch_size", config.batch_size)
         self.config = config
         self.number = 0
         keys = jax.random.split(jax.random.key(config.seed), len(config.families) + 1)
         params = entity.init(config.spec, keys[0])
         mean = jax.tree.map(jnp.copy, params)
-        self.learner = Learner(params, mean, optimiser(config).init(params))
-        self.grounds = [make_ground(f, config.seed + i) for i, f in enumerate(config.families)]
-        self.walks = [begin(f, g, k, config.num_envs) for f, g, k in
+        self.learner = everywhere(Learner(params, mean, optimiser(config).init(params)))
+        self.grounds = [everywhere(make_ground(f, config.seed + i))
+                        for i, f in enumerate(config.families)]
+        self.walks = [spread_walk(begin(f, g, k, config.num_envs)) for f, g, k in
                       zip(config.families, self.grounds, keys[1:], strict=True)]
         self.memories = [Memory(config.capacity) for _ in config.families]
 
@@ -344,7 +375,7 @@ class Dagger:
             self.memories[i].add(label(ground, self.walks[i]))
             rng = np.random.default_rng([config.seed, self.number, i])
             for _ in range(config.batches):
-                batch = self.memories[i].draw(rng, config.batch_size)
+                batch = spread(self.memories[i].draw(rng, config.batch_size))
                 self.learner, value = learn(config, family, ground, self.learner, batch)
                 losses.append(value)
         self.number += 1
