@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,3 +74,24 @@ def make_planner(name: str, *, policy: Path | None = None, objective: Objective 
     if how.rollouts > 1:
         return BestOfPlanner(Policy.load(policy), how.rollouts, objective)
     return LearnedPlanner.load(policy, decode="sample" if how.sample else "argmax")
+
+
+def check_planner(planner: Planner, snapshot: Snapshot) -> None:
+    """Raises InputError if a planner cannot serve a mission.
+
+    `snapshot` holds all its targets, those that events will bring too.
+    """
+    from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
+
+    policy = getattr(planner, "policy", None)
+    if isinstance(policy, Policy):
+        policy.check(snapshot)
+    count = len(snapshot.target_cells)
+    if isinstance(planner, ExactPlanner) and count > MAX_TARGETS:
+        raise InputError("--planner exact", f"{count} targets, those of events counted; the exact "
+                         f"planner takes up to {MAX_TARGETS}; use greedy")
+
+
+def ask(planners: Sequence[Planner], snapshots: Sequence[Snapshot]) -> list[IntArray]:
+    """The joint actions [N] of planners that are asked at the same time."""
+    return [planner.act(snapshot) for planner, snapshot in zip(planners, snapshots, strict=True)]

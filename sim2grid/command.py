@@ -158,7 +158,7 @@ def _execution(args: Args, prepared: Prepared, planner: Planner) -> Execution:
 def _drive(args: Args, prepared: Prepared, execution: Execution) -> dict[str, float]:
     """Runs the physics; returns wall-clock times. Raises KeyboardInterrupt when stopped."""
     from moonteam.physics.backends import make_backend
-    from sim2grid.execute import run as run_executions
+    from sim2grid.drive import run as run_executions
 
     _say(f"compiling the {args.backend} physics "
                "(kept for later runs; the first time takes longest)")

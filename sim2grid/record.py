@@ -17,8 +17,9 @@ from moonteam.scenario import Cell
 
 Ending = Literal["arrived", "timeout", "lost", "cut"]
 LossCause = Literal["fallen", "stuck", "not_a_number", "off_the_map", "event"]
-ReplanCause = Literal["timeout", "wrong_cell", "robot_lost", "new_target"]
-FailureCause = Literal["max_steps", "unsolvable", "engine", "interrupted"]
+ReplanCause = Literal["timeout", "wrong_cell", "robot_lost", "new_target", "slowed", "silent",
+                      "heard_again", "impassable"]
+FailureCause = Literal["max_steps", "unsolvable", "plan_over", "engine", "interrupted"]
 
 XY = npt.NDArray[np.float64]  # [2] m
 

@@ -58,6 +58,15 @@ def with_target(snapshot: Snapshot, target: Target, need: int) -> Snapshot:
         solved=np.append(snapshot.solved, False))
 
 
+def without_cell(snapshot: Snapshot, kind: int, cell: npt.NDArray[np.int32]) -> Snapshot:
+    """The snapshot in which a kind (index into `passable`) cannot enter a cell [2]."""
+    kinds = int(snapshot.agent_kinds.max()) + 1
+    open_map = np.ones((kinds, snapshot.size[1], snapshot.size[0]), bool)
+    passable = (open_map if snapshot.passable is None else snapshot.passable).copy()
+    passable[kind, cell[1], cell[0]] = False
+    return replace(snapshot, passable=passable)
+
+
 def contributors(snapshot: Snapshot, present: BoolArray, target: int) -> list[int]:
     """Robots among those `present` [R] whose skills meet the target now; empty if they do not."""
     need = int(snapshot.target_skills[target])

@@ -13,7 +13,8 @@ import pytest
 from moonteam import mission as missions
 from moonteam.robots.base import CONTROL_PERIOD
 from moonteam.scenario import ACTIONS
-from sim2grid.execute import Body, Execution, run
+from sim2grid.drive import run
+from sim2grid.execute import Body, Execution
 from sim2grid.frames import Frame
 from sim2grid.replan import grid_problem
 

@@ -60,7 +60,7 @@ def test_time_out_with_progress_is_replanned_from_the_true_cell(mission, execute
 
 def test_stuck_after_two_time_outs_without_progress(mission, execute, script):
     spec = mission(["a wheeled A 0 0", "b legged A 3 3"], ["A OR 3 0"])
-    steps = ["right stay"] * 2 + ["stay down"] * 3
+    steps = ["right stay", "up stay", *["stay down"] * 3]
     done = execute(spec, script(*steps), faults={(0, 0.0): "still"})
     assert [(x.robot, x.cause) for x in done.record.losses] == [(0, "stuck")]
     assert done.record.success
