@@ -20,20 +20,25 @@ from moonteam import files
 from moonteam.mission import Mission
 from sim2grid.frames import Frame
 from sim2grid.picture import (
+    GREY,
     INK,
     NIGHT,
     OPEN,
+    REPLAN,
     SOLVED,
+    STATES,
     Ground,
     MapPicture,
     RobotMark,
     TargetMark,
+    draw_replan,
     draw_robot,
     font,
     requirement,
     robot_color,
 )
 from sim2grid.record import Record
+from sim2grid.story import Replan, Story
 
 WIDTH, HEIGHT = 854, 480
 FPS = 20
@@ -42,9 +47,10 @@ SHORTEST_S = 9.0
 HOLD_S = 2.0  # the last moment stands still
 SPEEDS = (0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100)
 MARGIN = 10
-CLOSE = (168, 112)  # size of a robot's close view
-MAX_CLOSE = 3
-FREE = (MARGIN, MARGIN, WIDTH - 220, HEIGHT - CLOSE[1] - 2 * MARGIN)
+SIDE = 190  # of the map beside 3-D pictures
+CLOSE = (168, 112)  # largest size of a robot's close view
+NEWS_S = 1.6  # film seconds for which the cause of a new plan is told
+FREE = (MARGIN, MARGIN, WIDTH - SIDE - 3 * MARGIN, HEIGHT - CLOSE[1] - 2 * MARGIN)
 """Left, top, right, bottom of what no map, list or close view covers."""
 
 
@@ -56,9 +62,11 @@ class Moment:
     index: int  # of the logged pose
     decision: int
     solved: frozenset[int]
-    status: tuple[str, ...]  # one word a robot
+    status: tuple[str, ...]  # one word a robot: moving, waiting, late, lost and why
+    speeds: tuple[float, ...]  # m/s
     goals: tuple[npt.NDArray, ...]  # [2] m, where each robot is bound
     targets: int  # how many are known
+    replans: tuple[Replan, ...]  # so far
 
 
 class Views(Protocol):
@@ -89,14 +97,12 @@ class Film:
                  barred: npt.NDArray[np.bool_] | None = None, views: Views | None = None):
         self.mission, self.record, self.title, self.views = mission, record, title, views
         self.frame, self.ground, self.bases, self.barred = frame, ground, bases, barred
-        self.times = np.concatenate(record.times)
-        self.qpos = np.concatenate(record.qpos)
-        self.paths = [self.qpos[:, b:b + 2].astype(float) for b in bases]
-        # Drawn afresh in every second frame, and when a target is solved.
+        self.story = Story(mission, record, frame, bases)
+        self.times, self.qpos, self.paths = self.story.times, self.story.qpos, self.story.paths
+        # A robot's close view is drawn afresh now and then, and when a target is solved.
         self._close: dict[int, tuple[frozenset[int], Image.Image]] = {}
         self.speed = playback(record.seconds())
-        side = 190 if views else HEIGHT - 2 * MARGIN
-        self.map = MapPicture(frame, ground, side, barred)
+        self.map = MapPicture(frame, ground, SIDE if views else HEIGHT - 2 * MARGIN, barred)
 
     def with_views(self, views: Views) -> Film:
         """The same film with 3-D pictures."""
@@ -105,8 +111,8 @@ class Film:
 
     def last_map(self, side: int) -> Image.Image:
         """The map at the end of the mission with every path, `side` pixels."""
-        robots, targets = self._marks(self.moment(self.record.seconds()))
-        return MapPicture(self.frame, self.ground, side, self.barred).draw(robots, targets)
+        moment = self.moment(self.record.seconds())
+        return MapPicture(self.frame, self.ground, side, self.barred).draw(*self._marks(moment))
 
     @property
     def num_frames(self) -> int:
@@ -123,7 +129,7 @@ class Film:
         """[HEIGHT, WIDTH, 3] pictures, in order."""
         last = None
         for k in range(self.num_frames - self._still):
-            last = self._compose(self.moment(k / FPS * self.speed))
+            last = self.picture(k / FPS * self.speed)
             yield last
         for _ in range(self._still):
             if last is not None:
@@ -131,35 +137,44 @@ class Film:
 
     def moment(self, time_s: float) -> Moment:
         """What is going on at a mission second."""
-        record = self.record
+        record, story = self.record, self.story
         time_s = min(time_s, record.seconds())
-        index = min(int(np.searchsorted(self.times, time_s - 1e-9)), len(self.times) - 1)
         decision = sum(d.time_s <= time_s + 1e-9 for d in record.decisions)
-        late = sum(1 for d, cause in record.replans if cause == "new_target" and d >= decision)
-        status, goals = zip(*(self._robot_at(i, time_s) for i in range(len(self.paths))),
-                            strict=True)
-        return Moment(time_s, index, decision, frozenset(record.solved_at(time_s)), status,
-                      goals, len(record.targets) - late)
+        robots = range(len(self.paths))
+        status, goals = zip(*(story.state(i, time_s) for i in robots), strict=True)
+        return Moment(
+            time_s, story.index(time_s), decision, frozenset(record.solved_at(time_s)), status,
+            tuple(story.speed(i, time_s) for i in robots), goals, story.targets_at(decision),
+            tuple(r for r in story.replans if r.time_s <= time_s + 1e-9))
 
+    def picture(self, time_s: float) -> npt.NDArray[np.uint8]:
+        """[HEIGHT, WIDTH, 3]: the film's picture of a mission second."""
+        moment = self.moment(time_s)
+        top = self.map.draw(*self._marks(moment), labels=self.views is None)
+        if self.views is None:
+            image = Image.new("RGB", (WIDTH, HEIGHT), NIGHT)
+            image.paste(top, (MARGIN, MARGIN))
+            side = self.map.size[0] + 3 * MARGIN
+            pen = ImageDraw.Draw(image, "RGBA")
+            self._words(pen, moment, (side, MARGIN))
+            bottom = self._target_list(pen, moment, (side, 125), HEIGHT - 34 * len(self.paths))
+            self._robot_list(pen, moment, (side, bottom + 14))
+            return np.asarray(image)
+        image = Image.fromarray(self.views.main(moment, self.qpos[moment.index]))
+        pen = ImageDraw.Draw(image, "RGBA")
+        left = WIDTH - MARGIN - top.width
+        pen.rectangle([left - 3, MARGIN - 3, left + top.width + 2, MARGIN + top.height + 2],
+                      fill=(*NIGHT, 255))
+        image.paste(top, (left, MARGIN))
+        self._words(pen, moment, (MARGIN, MARGIN - 2))
+        free = self._close_views(image, pen, moment) < left
+        self._target_list(pen, moment, (left, MARGIN + top.height + 8),
+                          HEIGHT - MARGIN if free else FREE[3])
+        return np.asarray(image)
 
-    def _robot_at(self, robot: int, time_s: float) -> tuple[str, npt.NDArray]:
-        """A word for what the robot does, and the point [2] m that it is bound for."""
-        goal = self.paths[robot][0]
-        word = "waits"
-        for leg in self.record.legs:
-            if leg.robot != robot or leg.start_s > time_s + 1e-9:
-                continue
-            goal = leg.waypoint
-            under_way = leg.end_s is None or time_s < leg.end_s - 1e-9
-            word = "moves" if leg.moving and under_way else "waits"
-            if leg.ended == "timeout" and not under_way:
-                word = "late"
-        for loss in self.record.losses:
-            if loss.robot == robot and loss.time_s <= time_s + 1e-9:
-                word = loss.cause.replace("_", " ")
-        return word, goal
-
-    def _marks(self, moment: Moment) -> tuple[list[RobotMark], list[TargetMark]]:
+    def _marks(self, moment: Moment) -> tuple[
+            list[RobotMark], list[TargetMark], list[npt.NDArray]]:
+        """Robots, targets and the places [2] m of new plans, for the map."""
         lost = {x.robot for x in self.record.losses if x.time_s <= moment.time_s + 1e-9}
         step = max(1, (moment.index + 1) // 1500)
         robots = []
@@ -169,84 +184,92 @@ class Film:
             robots.append(RobotMark(spec.name, spec.kind, thinned, i in lost))
         targets = [TargetMark(self.record.target_names[j], target, j in moment.solved)
                    for j, target in enumerate(self.record.targets[:moment.targets])]
-        return robots, targets
-
-    def _compose(self, moment: Moment) -> npt.NDArray[np.uint8]:
-        qpos = self.qpos[moment.index]
-        robots, targets = self._marks(moment)
-        top = self.map.draw(robots, targets, labels=self.views is None)
-        if self.views is None:
-            image = Image.new("RGB", (WIDTH, HEIGHT), NIGHT)
-            image.paste(top, (MARGIN, MARGIN))
-            side = self.map.size[0] + 3 * MARGIN
-            pen = ImageDraw.Draw(image, "RGBA")
-            self._words(pen, moment, (side, MARGIN))
-            self._target_list(pen, moment, (side, 110))
-            self._robot_list(pen, moment, (side, 130 + 22 * moment.targets))
-            return np.asarray(image)
-        image = Image.fromarray(self.views.main(moment, qpos))
-        pen = ImageDraw.Draw(image, "RGBA")
-        left = WIDTH - MARGIN - top.width
-        pen.rectangle([left - 3, MARGIN - 3, left + top.width + 2, MARGIN + top.height + 2],
-                      fill=(*NIGHT, 255))
-        image.paste(top, (left, MARGIN))
-        self._words(pen, moment, (MARGIN, MARGIN - 2))
-        self._target_list(pen, moment, (left, MARGIN + top.height + 8))
-        self._close_views(image, pen, moment, qpos)
-        return np.asarray(image)
+        return robots, targets, [r.xy for r in moment.replans if r.xy is not None]
 
     def _words(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int]) -> None:
-        """Title, then time, decision and solved count."""
+        """Title, then time, decision and solved count, then news."""
         x, y = at
         _shadowed(pen, (x, y), self.title, 18, INK)
         done = len(moment.solved)
-        speed = f"{self.speed:g}x"
-        _shadowed(pen, (x, y + 25),
-                  f"{moment.time_s:5.1f} s   ({speed})    decision {moment.decision}", 15, INK)
+        _shadowed(pen, (x, y + 25), f"{moment.time_s:.1f} s  ({self.speed:g}x)   "
+                  f"decision {moment.decision}", 15, INK)
         _shadowed(pen, (x, y + 46), f"solved {done} of {moment.targets}", 15,
                   SOLVED if done == moment.targets else INK)
+        if moment.replans:
+            width = pen.textlength(f"solved {done} of {moment.targets}", font(15, True))
+            draw_replan(pen, (x + width + 24, y + 56), 6)
+            _shadowed(pen, (x + width + 34, y + 46), f"{len(moment.replans)}", 15, REPLAN)
         if moment.time_s >= self.record.seconds() - 1e-9:
             word, color = ("mission complete", SOLVED) if self.record.success else (
                 f"mission failed: {(self.record.failure or '').replace('_', ' ')}", OPEN)
             _shadowed(pen, (x, y + 67), word, 17, color)
+        elif news := [r.words for r in moment.replans
+                      if r.time_s > moment.time_s - NEWS_S * self.speed]:
+            _shadowed(pen, (x, y + 67), f"replan: {', '.join(news[-2:])}", 15, REPLAN)
 
-    def _target_list(self, pen: ImageDraw.ImageDraw, moment: Moment,
-                     at: tuple[int, int]) -> None:
+    def _target_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int],
+                     bottom: int) -> int:
+        """The targets, closer together where they are many; returns where the list ends."""
         x, y = at
+        row = min(20.0, max(10.0, (bottom - y) / max(moment.targets, 1)))
         for j, target in enumerate(self.record.targets[:moment.targets]):
-            color = SOLVED if j in moment.solved else OPEN
-            pen.rectangle([x, y + 3, x + 11, y + 14], fill=(*NIGHT, 160), outline=color, width=3)
+            color, top = SOLVED if j in moment.solved else OPEN, round(y + j * row)
+            box = round(0.55 * row)
+            pen.rectangle([x, top + 3, x + box, top + 3 + box], fill=(*NIGHT, 160),
+                          outline=color, width=3 if row > 15 else 2)
             text = f"{self.record.target_names[j]}  {requirement(target)}"
-            _shadowed(pen, (x + 18, y), text, 13, color)
-            y += 20
+            _shadowed(pen, (x + 18, top), text, round(0.66 * row), color)
+        return round(y + moment.targets * row)
 
     def _robot_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int]) -> None:
         x, y = at
         for i, spec in enumerate(self.mission.robots):
             draw_robot(pen, spec.kind, (x + 7, y + 9), 7, robot_color(i))
-            skills = "".join(spec.skills)
-            _shadowed(pen, (x + 20, y), f"{spec.name} ({skills})  {moment.status[i]}", 14,
+            _shadowed(pen, (x + 20, y), f"{spec.name}  {spec.kind} {''.join(spec.skills)}", 13,
                       robot_color(i))
-            y += 22
+            _shadowed(pen, (x + 20, y + 16), _doing(moment, i), 12,
+                      STATES.get(moment.status[i].split(":")[0], INK))
+            y += 34
 
-    def _close_views(self, image: Image.Image, pen: ImageDraw.ImageDraw, moment: Moment,
-                     qpos: npt.NDArray) -> None:
-        """A strip along the bottom: each robot from near by, its skills, what it does."""
-        if self.views is None:
-            return
-        width, height = CLOSE
-        for i, spec in enumerate(self.mission.robots[:MAX_CLOSE]):
-            x, y = MARGIN + i * (width + MARGIN), HEIGHT - MARGIN - height
-            color = robot_color(i)
-            pen.rectangle([x - 2, y - 2, x + width + 1, y + height + 1], fill=(*color, 255))
-            even = round(moment.time_s / self.speed * FPS) % 2 == 0
-            if even or i not in self._close or self._close[i][0] != moment.solved:
-                drawn = Image.fromarray(self.views.close(moment, qpos, i))
-                self._close[i] = (moment.solved, drawn)
-            image.paste(self._close[i][1], (x, y))
+    def _close_views(self, image: Image.Image, pen: ImageDraw.ImageDraw, moment: Moment) -> int:
+        """The strip along the bottom: each robot from near by, its name, kind and skills, what
+        it does and how fast. Returns where the strip ends.
+        """
+        count = len(self.mission.robots)
+        width = min(CLOSE[0], (WIDTH - (count + 1) * MARGIN) // count)
+        y, x = HEIGHT - MARGIN - CLOSE[1], MARGIN
+        number = round(moment.time_s / self.speed * FPS)
+        for i, spec in enumerate(self.mission.robots):
+            lost = moment.status[i].startswith("lost")
+            color = GREY if lost else robot_color(i)
+            pen.rectangle([x - 2, y - 2, x + width + 1, y + CLOSE[1] + 1], fill=(*color, 255))
+            cut = (CLOSE[0] - width) // 2
+            image.paste(self._close_view(moment, i, number).crop(
+                (cut, 0, cut + width, CLOSE[1])), (x, y))
             draw_robot(pen, spec.kind, (x + 12, y + 12), 6, color)
-            _shadowed(pen, (x + 23, y + 3), f"{spec.name} ({''.join(spec.skills)})", 12, color)
-            _shadowed(pen, (x + 6, y + height - 18), moment.status[i], 12, INK)
+            _shadowed(pen, (x + 23, y + 3), spec.name, 12, color)
+            _shadowed(pen, (x + 23, y + 18), f"{spec.kind} {''.join(spec.skills)}", 10, INK)
+            word = moment.status[i]
+            state = STATES.get(word.split(":")[0], INK)
+            _shadowed(pen, (x + 6, y + CLOSE[1] - 18), word, 12, state)
+            if not lost:
+                speed = f"{moment.speeds[i]:.2f} m/s"
+                wide = pen.textlength(speed, font(12, True))
+                high = 18 if width > 140 else 34
+                right = x + width - 6 - wide if width > 140 else x + 6
+                _shadowed(pen, (right, y + CLOSE[1] - high), speed, 12, INK)
+            x += width + MARGIN
+        return x - MARGIN
+
+    def _close_view(self, moment: Moment, robot: int, number: int) -> Image.Image:
+        """[CLOSE]: drawn afresh in every second frame, in turn where robots are many."""
+        held = self._close.get(robot)
+        turns = max(2, len(self.mission.robots) // 2)
+        if held is None or held[0] != moment.solved or (number + robot) % turns == 0:
+            assert self.views is not None
+            drawn = self.views.close(moment, self.qpos[moment.index], robot)
+            held = self._close[robot] = moment.solved, Image.fromarray(drawn)
+        return held[1]
 
 
 def write(film: Film, path: str | os.PathLike[str],
@@ -262,6 +285,12 @@ def write(film: Film, path: str | os.PathLike[str],
         for picture in film.frames():
             writer.add_image(picture)
             progress()
+
+
+def _doing(moment: Moment, robot: int) -> str:
+    """As in: moving 0.42 m/s."""
+    word = moment.status[robot]
+    return word if word.startswith("lost") else f"{word}  {moment.speeds[robot]:.2f} m/s"
 
 
 def _shadowed(pen: ImageDraw.ImageDraw, at: tuple[float, float], text: str, size: int,

@@ -26,6 +26,10 @@ NIGHT: Color = (14, 17, 26)
 OPEN: Color = (255, 86, 60)
 SOLVED: Color = (70, 215, 110)
 BARRED: Color = (150, 60, 60)
+REPLAN: Color = (255, 250, 235)
+GREY: Color = (130, 130, 130)
+STATES: dict[str, Color] = {
+    "moving": INK, "waiting": (170, 178, 195), "late": (255, 180, 60), "lost": OPEN}
 ROBOTS: tuple[Color, ...] = (
     (64, 196, 255), (255, 214, 64), (236, 120, 255), (120, 255, 214),
     (255, 160, 90), (150, 160, 255), (190, 255, 100), (255, 130, 170))
@@ -106,8 +110,10 @@ class MapPicture:
         return self.width // SMOOTH, self.height // SMOOTH
 
     def draw(self, robots: Sequence[RobotMark], targets: Sequence[TargetMark],
-             labels: bool = True) -> Image.Image:
-        """The map with targets, paths and robots; `labels` writes names beside them."""
+             replans: Sequence[npt.NDArray] = (), labels: bool = True) -> Image.Image:
+        """The map with targets, paths, robots, and a mark at each place [2] m that brought a
+        new plan; `labels` writes names beside them.
+        """
         image = self._base.copy()
         pen = ImageDraw.Draw(image)
         for mark in targets:
@@ -117,6 +123,9 @@ class MapPicture:
                 points = [tuple(p) for p in self._pixels(robot.path)]
                 pen.line(points, fill=robot_color(i), width=max(2, round(self.pixel * 0.07)),
                          joint="curve")
+        for place in replans:
+            x, y = self._pixels(place)
+            draw_replan(pen, (float(x), float(y)), max(self.pixel * 0.2, 4.5 * SMOOTH))
         for i, robot in enumerate(robots):
             self._robot(pen, i, robot, labels)
         return image.resize(self.size, Image.Resampling.BOX)
@@ -156,7 +165,8 @@ class MapPicture:
         pen.rectangle([x - reach, y - reach, x + reach, y + reach], outline=color, width=width)
         size = round(max(self.pixel * 0.26, (12 if labels else 9) * SMOOTH))
         need = requirement(mark.target)
-        inside = self.pixel * 0.9 > pen.textlength(need, font(size, True))
+        # What solved a target stands in it: its needs are written beside its name then.
+        inside = not mark.solved and self.pixel * 0.9 > pen.textlength(need, font(size, True))
         if inside:
             _text(pen, (x, y), need, color, size, "mm")
         if labels:
@@ -173,7 +183,7 @@ class MapPicture:
 
     def _robot(self, pen: ImageDraw.ImageDraw, index: int, robot: RobotMark,
                labels: bool) -> None:
-        color = (130, 130, 130) if robot.lost else robot_color(index)
+        color = GREY if robot.lost else robot_color(index)
         x, y = self._pixels(robot.path[-1])
         draw_robot(pen, robot.kind, (float(x), float(y)),
                    max(self.pixel * 0.24, 4.5 * SMOOTH), color)
@@ -199,6 +209,13 @@ def draw_robot(pen: ImageDraw.ImageDraw, kind: str, at: tuple[float, float], rea
     else:
         side = reach * 0.85
         pen.rectangle([x - side, y - side, x + side, y + side], color, NIGHT, line)
+
+
+def draw_replan(pen: ImageDraw.ImageDraw, at: tuple[float, float], reach: float) -> None:
+    """A white diamond: what happened here brought a new plan."""
+    x, y = at
+    for size, color in ((reach, NIGHT), (reach * 0.75, REPLAN), (reach * 0.35, NIGHT)):
+        pen.polygon([(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill=color)
 
 
 def _text(pen: ImageDraw.ImageDraw, at: tuple[float, float], text: str, color: Color, size: int,

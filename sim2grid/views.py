@@ -1,13 +1,16 @@
 """The film's 3-D pictures: one camera on the whole scene, one on each robot.
 
 Targets are outlines on the ground with a post, red while open and green once solved; each
-robot draws its trail, and a small square lies where it is bound.
+robot draws its trail, a small square lies where it is bound, and a white diamond where
+something brought a new plan. A dark disc under each robot says where on the ground it is: real
+shadows are dear without a GPU.
 """
 
 from __future__ import annotations
 
 import math
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -21,15 +24,17 @@ from moonteam.physics.render import (
     path,
     post,
     square,
+    turn_z_to,
 )
 from sim2grid.film import CLOSE, FREE, HEIGHT, WIDTH, Film, Moment
-from sim2grid.picture import OPEN, SOLVED, Color, robot_color
+from sim2grid.picture import OPEN, REPLAN, SOLVED, Color, robot_color
 from sim2grid.prepare import Prepared
 
 Rgba = tuple[float, float, float, float]
 
 ELEVATION = -38.0  # degrees
 SWING = 14.0  # degrees the camera swings to each side while the film lasts
+DISC = 0.8  # of the disc under a robot, in its footprint's radius
 WHOLE_MAP_M = 14.0  # maps up to this size are always seen whole
 TRAIL_M = 0.25  # between the points of a trail
 AHEAD_S, BEHIND_S = 8.0, 4.0  # mission seconds over which the camera averages what it follows
@@ -48,17 +53,19 @@ class SceneViews:
         self._targets = [self._target_markers(j) for j in range(len(film.record.targets))]
         self._posts = np.array([m[True][-1].position for m in self._targets])
         self._goals: dict[tuple[int, float, float], list[Marker]] = {}
+        self._replans = [[] if r.xy is None else self._replan(r.xy)
+                         for r in film.story.replans]
 
     def main(self, moment: Moment, qpos: npt.NDArray) -> npt.NDArray[np.uint8]:
         """[HEIGHT, WIDTH, 3]: the whole scene."""
-        return self._wide.frame(qpos, self._camera(moment), self._markers(moment))
+        return self._wide.frame(qpos, self._camera(moment), self._markers(moment, qpos))
 
     def close(self, moment: Moment, qpos: npt.NDArray, robot: int) -> npt.NDArray[np.uint8]:
         """[CLOSE[1], CLOSE[0], 3]: one robot from near by."""
         base = self.prepared.bodies[robot].base
         camera = follow(qpos[base:base + 3], distance=1.9, elevation=-20.0,
                         azimuth=130.0 + 3.0 * moment.time_s / self.film.speed)
-        large = self._near.frame(qpos, camera, self._target_part(moment))
+        large = self._near.frame(qpos, camera, self._ground_part(moment, qpos))
         return large.reshape(CLOSE[1], 2, CLOSE[0], 2, 3).mean(axis=(1, 3)).astype(np.uint8)
 
     def shut(self) -> None:
@@ -103,20 +110,41 @@ class SceneViews:
             points = np.concatenate([points, self._posts])
         return points[np.isfinite(points).all(axis=1)]
 
-    def _markers(self, moment: Moment) -> list[Marker]:
-        """Targets, goals and trails of a moment."""
-        found = self._target_part(moment)
+    def _markers(self, moment: Moment, qpos: npt.NDArray) -> list[Marker]:
+        """Targets, new plans, goals and trails of a moment."""
+        found = self._ground_part(moment, qpos)
         for i, goal in enumerate(moment.goals):
-            if moment.status[i] == "moves":
+            if moment.status[i] == "moving":
                 found += self._goal(i, goal)
             times, trail = self._trails[i]
             count = int(np.searchsorted(times, moment.time_s, side="right"))
             found += trail[:max(count - 1, 0)]
         return found
 
-    def _target_part(self, moment: Moment) -> list[Marker]:
-        return [marker for j in range(moment.targets)
-                for marker in self._targets[j][j in moment.solved]]
+    def _ground_part(self, moment: Moment, qpos: npt.NDArray) -> list[Marker]:
+        """What lies or stands on the ground: discs under robots, targets, new plans' places."""
+        found = self._discs(qpos)
+        for j in range(moment.targets):
+            found += self._targets[j][j in moment.solved]
+        for markers in self._replans[:len(moment.replans)]:
+            found += markers
+        return found
+
+    def _discs(self, qpos: npt.NDArray) -> list[Marker]:
+        """A flat dark disc on the ground under each robot."""
+        xy = np.stack([np.nan_to_num(qpos[b:b + 2]) for b in self.prepared.bases])
+        feet = on_ground(self.scene, xy, 0.015)
+        normals = np.asarray(self.scene.surface.plane(jnp.asarray(xy, jnp.float32), 0.3)[1])
+        return [Marker(mujoco.mjtGeom.mjGEOM_CYLINDER,
+                       (DISC * robot.kind.footprint, 0.002, 0.0), foot,
+                       (0.0, 0.0, 0.0, 0.5), turn_z_to(normal))
+                for robot, foot, normal in zip(self.scene.robots, feet, normals, strict=True)]
+
+    def _replan(self, xy: npt.NDArray) -> list[Marker]:
+        """A diamond on the ground, wide enough to show around the robot that stands in it."""
+        reach = 0.48 * self.film.frame.cell_m
+        corners = reach * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1]])
+        return path(on_ground(self.scene, xy[None] + corners, 0.05), _rgba(REPLAN), 0.035)
 
     def _target_markers(self, target: int) -> dict[bool, list[Marker]]:
         """The target's markers, open and solved."""

@@ -33,7 +33,7 @@ def test_a_film_lasts_ten_seconds_at_least_and_twenty_at_most(short_film):
 
 def test_moments_tell_what_was_going_on(short_film):
     start = short_film.moment(0.0)
-    assert start.status == ("moves", "waits")
+    assert start.status == ("moving", "waiting")
     assert start.decision == 1
     assert not start.solved
     end = short_film.moment(1e9)

@@ -226,7 +226,7 @@ def path(points: Points, rgba: Color, width: float = 0.02) -> list[Marker]:
         if length < 1e-6:
             continue
         found.append(Marker(mujoco.mjtGeom.mjGEOM_CAPSULE, (width, length / 2, 0.0),
-                            (start + end) / 2, rgba, _turn_z_to(along / length), glow=0.4))
+                            (start + end) / 2, rgba, turn_z_to(along / length), glow=0.4))
     return found
 
 
@@ -237,7 +237,7 @@ def on_ground(scene: Scene, xy: Points, above: float) -> Points:
     return np.concatenate([xy, height[:, None] + above], axis=1)
 
 
-def _turn_z_to(axis: Points) -> Points:
+def turn_z_to(axis: Points) -> Points:
     """A rotation matrix [3, 3] whose third column is the unit vector `axis` [3]."""
     helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
     x = np.cross(helper, axis)
