@@ -15,7 +15,7 @@ class Args:
 
     Whole plans and single decisions are kept apart, and first calls (compiling) from later
     ones. The text under the table says where the exact planner is faster; it is computed from
-    the measurements. Run it on a quiet machine.
+    the measurements. The process is kept on one core. Run it on a quiet machine.
 
     Examples:
       moonteam evaluate timing
@@ -49,8 +49,31 @@ class Args:
 
 def run(args: Args) -> int:
     """Measures, prints, saves."""
-    compilation.enable_cache()
+    from moonteam.evaluation import clock
+
+    with clock.one_core() as cores:
+        document = _measured(args, cores)
     from moonteam.evaluation import figures, report, timing
+
+    tables = [timing.pivot(document)]
+    if args.out:
+        files.write_json(args.out / "report.json", document)
+        files.write_text(args.out / "timing.csv", report.plain_csv(document["rows"]))
+        files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
+        figures.timing(args.out / "timing.png", document)
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(report.plain_markdown(document, tables))
+    else:
+        report.show_plain(document, tables)
+    return 0
+
+
+def _measured(args: Args, cores: str) -> dict:
+    """The report."""
+    compilation.enable_cache()
+    from moonteam.evaluation import timing
     from moonteam.planners.learned import Policy
 
     sizes = timing.Sizes(args.targets or (3, 4, 5, 6, 7, 8, 9, 10, 12), args.count, args.agents,
@@ -65,17 +88,4 @@ def run(args: Args) -> int:
         "side": args.side if args.side != 32 else None,
         "best-of": args.best_of if args.best_of != 16 else None,
         "budget": args.budget if args.budget != 10.0 else None, "seed": args.seed or None})
-    document = timing.evaluate(policy, sizes, command)
-    tables = [timing.pivot(document)]
-    if args.out:
-        files.write_json(args.out / "report.json", document)
-        files.write_text(args.out / "timing.csv", report.plain_csv(document["rows"]))
-        files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
-        figures.timing(args.out / "timing.png", document)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.plain_markdown(document, tables))
-    else:
-        report.show_plain(document, tables)
-    return 0
+    return timing.evaluate(policy, sizes, command, cores)

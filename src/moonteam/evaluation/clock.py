@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,3 +52,21 @@ def measure(call: Callable[[Any], Any], arguments: Sequence[Any], budget: float)
         if stop > until:
             break
     return times_of(seconds, first)
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[str]:
+    """Keeps this thread and those it starts on one core; yields in words how that went.
+
+    JAX starts its threads when it is first used: enter before it is imported.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield "not kept on one core: this system has no processor affinity"
+        return
+    allowed = os.sched_getaffinity(0)
+    late = "; JAX was loaded before, its threads are not" if "jax" in sys.modules else ""
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield f"the process is kept on one core (processor affinity){late}"
+    finally:
+        os.sched_setaffinity(0, allowed)

@@ -31,8 +31,8 @@ from moonteam.planners.base import Objective
 from moonteam.planners.learned import Brain, Policy, masked
 from moonteam.planners.travel import distance_fields
 
-MOST_EPISODES = 512
-_PAIRS = 1 << 16  # token pairs of the pool, which is what the attention of a network holds
+MOST_EPISODES = 256
+_PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of a network holds
 _STEPS = 8  # between two looks at which episodes have ended
 _TIE = 2.0**-20
 

@@ -37,7 +37,7 @@ from moonteam.policies.recurrent import RecurrentSpec
 
 OBJECTIVES: tuple[Objective, ...] = ("makespan", "moves", "weighted")
 EXACT = "exact(makespan)"
-DECISION, PLAN = "policy, one decision", "policy, whole plan"
+DECISION, PLAN, BEST = "policy, one decision", "policy, whole plan", "policy, best of"
 
 
 @dataclass(frozen=True)
@@ -107,13 +107,13 @@ def methods(policy: Policy, sizes: Sizes, targets: int) -> dict[str, Callable[[S
 
     found[DECISION] = decide
     found[PLAN] = lambda moment: plan_best_of(policy, moment, 1)
-    found[f"policy, best of {sizes.best_of} plans"] = (
+    found[f"{BEST} {sizes.best_of} plans"] = (
         lambda moment: plan_best_of(policy, moment, sizes.best_of))
     return found
 
 
-def evaluate(given: Policy | None, sizes: Sizes, command: str) -> dict:
-    """The measurements as a JSON-able document."""
+def evaluate(given: Policy | None, sizes: Sizes, command: str, cores: str = "") -> dict:
+    """The measurements as a JSON-able document; `cores` says in words what ran on how many."""
     sizes.check()
     rows = []
     for targets in track(list(sizes.targets), "timing", len(sizes.targets)):
@@ -126,10 +126,10 @@ def evaluate(given: Policy | None, sizes: Sizes, command: str) -> dict:
     kind = "untrained network of the paper" if given is None else given.source.kind
     notes = [*findings(rows),
              f"{sizes.num_agents} agents on {sizes.side} x {sizes.side}, up to {sizes.count} "
-             f"random scenarios a size; medians of single calls, first calls apart. A search's "
-             f"decision is its plan. The policy's whole plan is one jitted call of "
-             f"{sizes.max_steps} decisions; its network: {kind}, whose time does not depend "
-             "on its weights."]
+             f"random scenarios a size; medians of single calls, first calls apart"
+             f"{'; ' + cores if cores else ''}. A search's decision is its plan. The policy's "
+             "plan is one jitted call that ends when no rollout can become better, or with "
+             f"{sizes.max_steps} decisions; its network: {kind}."]
     return {"title": "planning time against the number of targets", "rows": rows,
             "notes": notes, "meta": provenance.meta(command, sizes.seed)}
 
@@ -149,8 +149,8 @@ def findings(rows: Sequence[dict]) -> list[str]:
                         f"whole mission sooner than {what} at {_list(faster)} targets "
                         f"(at {faster[-1]}: {_versus(exact_times, other, faster[-1])}).")
         if slower:
-            said.append(f"It takes longer than {what} at {_list(slower)} targets (at "
-                        f"{slower[0]}: {_versus(exact_times, other, slower[0])}).")
+            said.append(f"The exact planner (makespan) takes longer than {what} at "
+                        f"{_list(slower)} targets (at {slower[0]}: {_versus(exact_times, other, slower[0])}).")
     slow = _by_targets(rows, "exhaustive(makespan)")
     shared = sorted(slow.keys() & exact_times.keys())
     if shared:
@@ -158,7 +158,18 @@ def findings(rows: Sequence[dict]) -> list[str]:
         said.append(f"Exhaustive search takes {slow[most] / exact_times[most]:.3g} times as long "
                     f"as the exact planner at {most} targets "
                     f"({_versus(exact_times, slow, most)}).")
-    return said
+    return said + _policy_times(rows)
+
+
+def _policy_times(rows: Sequence[dict]) -> list[str]:
+    """What the policy takes, at 7 targets or the size next to it."""
+    best = [row for row in rows if row["planner"].startswith(BEST)]
+    if not best:
+        return []
+    row = min(best, key=lambda row: abs(row["targets"] - 7))
+    one = _by_targets(rows, DECISION)[row["targets"]]
+    return [f"At {row['targets']} targets the policy makes one decision in {duration(one)} and "
+            f"the {row['planner'].removeprefix('policy, ')} in {duration(row['seconds'])}."]
 
 
 def _by_targets(rows: Sequence[dict], name: str) -> dict[int, float]:
