@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from moonteam.errors import InputError
@@ -23,8 +24,9 @@ class BestOfPlanner:
 
     name = "policy"
 
-    def __init__(self, policy: Policy, rollouts: int, objective: Objective):
-        self.policy, self.rollouts = policy, rollouts
+    def __init__(self, policy: Policy, rollouts: int, objective: Objective,
+                 temperature: float = 1.0):
+        self.policy, self.rollouts, self.temperature = policy, rollouts, temperature
         self.objective: Objective = objective
         self._stepwise = LearnedPlanner(policy)
         self._begin(0)
@@ -44,7 +46,7 @@ class BestOfPlanner:
         if self._expected is None or not same_moment(snapshot, self._expected):
             # From step 0, so that the compiled rollout has one length.
             plan = plan_best_of(self.policy, replace(snapshot, step=0), self.rollouts,
-                                self._seed, self.objective)
+                                self._seed, self.objective, self.temperature)
             self._actions = list(plan.actions)
         joint = self._actions.pop(0) if self._actions else self._stepwise.act(snapshot)
         held = replace(snapshot, solved=simulate.holding(snapshot))
@@ -58,22 +60,32 @@ def make_planner(name: str, *, policy: Path | None = None, objective: Objective 
 
     `policy` is the file of the planner `policy`; `decode` is argmax, sample or best-of-K.
     """
+    return planner_maker(name, policy=policy, objective=objective, decode=decode)()
+
+
+def planner_maker(name: str, *, policy: Path | None = None, objective: Objective = "makespan",
+                  decode: str = "argmax") -> Callable[[], Planner]:
+    """Makes any number of planners, each for a mission of its own; arguments as above."""
     if name == "exact":
         from moonteam.planners.exact import ExactPlanner
 
-        return ExactPlanner(objective)
+        return partial(ExactPlanner, objective)
     if name == "greedy":
         from moonteam.planners.greedy import GreedyPlanner
 
-        return GreedyPlanner(objective)
+        return partial(GreedyPlanner, objective)
     if name != "policy" or policy is None:
         raise InputError("--planner", f"{name!r} is not one of {', '.join(PLANNERS)}")
     from moonteam.evaluation.decode import parse
 
     how = parse(decode)
+    loaded = Policy.load(policy)
+    if how.symmetric:
+        loaded = loaded.symmetrised()
     if how.rollouts > 1:
-        return BestOfPlanner(Policy.load(policy), how.rollouts, objective)
-    return LearnedPlanner.load(policy, decode="sample" if how.sample else "argmax")
+        return partial(BestOfPlanner, loaded, how.rollouts, objective, how.temperature)
+    return partial(LearnedPlanner, loaded, "sample" if how.sample else "argmax",
+                   how.temperature, watch=how.sample or how.watch)
 
 
 def check_planner(planner: Planner, snapshot: Snapshot) -> None:

@@ -23,8 +23,12 @@ COMMANDS = {
     "evaluate replanning": (
         "moonteam.commands.evaluate_replanning", "5 + 5 targets, new ones while under way"),
     "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),
+    "evaluate execution": (
+        "sim2grid.evaluate_command", "many missions in physics: success, cost and failures"),
     "evaluate traverse": (
         "moonteam.commands.evaluate_traverse", "each kind of robot on its own over a site"),
+    "evaluate slopes": (
+        "moonteam.commands.evaluate_slopes", "how steep each kind of robot can go"),
     "site": ("moonteam.commands.site", "make, import and preview lunar terrain"),
     "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
     "bench train": ("training.bench", "training throughput"),
