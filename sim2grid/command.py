@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
+import numpy.typing as npt
 import tyro
 
 from moonteam import __version__, files, paths
@@ -34,13 +36,15 @@ class Args:
     reach over lunar ground; where the robots really are is what the planner sees next.
     Exit code 0 if every target was solved, 1 if the mission failed.
 
-    Files in the output folder: video.mp4 (map.mp4 where no 3-D pictures can be made), paths.png,
-    report.json (the same for the same seed), timing.json (wall-clock times), config.json.
+    Files in the output folder: report.html (all of it on one page), video.mp4 (map.mp4 where no
+    3-D pictures can be made), paths.png, report.json (the same for the same seed), timing.json
+    (wall-clock times), config.json.
 
     Examples:
       moonteam rollout demo
       moonteam rollout outpost --planner exact --backend native --out runs/outpost
       moonteam rollout my_mission.yaml --planner exact --no-video --json
+      moonteam rollout demo --planner exact --backend native --viewer
     """
 
     mission: tyro.conf.Positional[str]
@@ -63,63 +67,117 @@ class Args:
     """Output folder; runs/NAME by default."""
     video: bool = True
     """Make the video."""
+    viewer: bool = False
+    """Show the mission in a live 3-D window while it runs; needs a display."""
     json: bool = False
     """Print the report as one JSON document and nothing else."""
 
 
+@dataclass(frozen=True)
+class Run:
+    """One mission ready to be run: what to execute, where, and how to call it in the report."""
+
+    prepared: Prepared
+    execution: Execution
+    start: npt.NDArray  # [nq]
+    plan: GridPlan
+    who: str  # the planner's name in the report
+    objective: str | None
+    backend: str
+    seed: int
+    title: str  # of the film
+    command: str  # that makes it again
+    width: int = 1  # rows of the engine
+    row: int = 0  # the one that is used
+
+
 def run(args: Args) -> int:
     """Runs the mission and writes its folder; the exit code says whether it succeeded."""
-    mission = _load(args)
+    _check(args)
     from moonteam.compilation import enable_cache
 
     enable_cache()
-    from sim2grid.prepare import prepare
+    if args.viewer:
+        from sim2grid.viewer import check_display
 
-    planner = _planner(args)
-    prepared = prepare(mission, args.mission)
-    plan = _grid_plan(args, prepared, planner)
+        check_display()
+    made = _from_file(args)
+    mission = made.prepared.mission
     out = args.out or Path("runs") / mission.name
     _make_folder(out, args, mission)
-    execution = _execution(args, prepared, planner)
     interrupted = False
     try:
-        timing = _drive(args, prepared, execution)
+        timing = _drive(args, made)
     except KeyboardInterrupt:
         interrupted, timing = True, {}
-    report = _report(args, prepared, execution, plan)
+    report = _report(made)
     files.write_json(out / "report.json", report)
     files.write_json(out / "timing.json", timing)
-    film = _film(args, prepared, execution)
+    film = _film(made)
     _save_paths(film, out)
     if interrupted:
         print(f"moonteam: stopped after {report.seconds:g} s of the mission; {out}/report.json "
               "holds what was done", file=sys.stderr)
         return 130
-    made = _save_video(film, prepared, out) if args.video else None
+    video = _save_video(film, made.prepared, out) if args.video else None
+    _save_page(made, film, report, timing, out, video)
     if args.json:
         print(files.dump_json(report))
     else:
-        _show(report, timing, out, made)
+        _show(report, timing, out, video)
     return 0 if report.success else 1
 
 
-def _load(args: Args) -> Mission:
-    """The mission, named after its file where it has no name. Raises InputError."""
+def _check(args: Args) -> None:
+    """What can be said of the options alone. Raises InputError."""
+    from moonteam.evaluation.decode import parse
+
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
-    suffix = ".yml" if args.mission.endswith(".yml") else ".yaml"
-    path = paths.find(args.mission, "missions", suffix)
-    mission = missions.load(path)
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise InputError("--out", f"{args.out} is a file; a folder is needed")
+    parse(args.decode)
+
+
+def _from_file(args: Args) -> Run:
+    """The run of a mission file. Raises InputError for whatever it cannot be."""
+    from sim2grid.execute import Execution
+    from sim2grid.prepare import prepare
+
+    mission = _load(args.mission)
+    planner = _planner(args)
+    prepared = prepare(mission, args.mission)
+    plan = _grid_plan(prepared, planner, args.seed)
+    execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
+                          prepared.frame, seed=args.seed, mode=args.mode)
+    who = args.planner if args.planner != "policy" else f"policy {Path(args.policy).stem}"
+    return Run(prepared, execution, prepared.scene.qpos0, plan, args.planner,
+               None if args.planner == "policy" else args.objective, args.backend, args.seed,
+               f"{mission.name}: {who}", _command(args))
+
+
+def _command(args: Args) -> str:
+    """The command line of these options, but where it writes to."""
+    words = ["moonteam", "rollout", args.mission]
+    for field in fields(args):
+        value = getattr(args, field.name)
+        if field.name in ("mission", "out", "json", "viewer", "video") or value == field.default:
+            continue
+        words += ["--" + field.name.replace("_", "-"), str(value)]
+    return shlex.join(words)
+
+
+def _load(name: str) -> Mission:
+    """The mission, named after its file where it has no name. Raises InputError."""
+    suffix = ".yml" if name.endswith(".yml") else ".yaml"
+    path = paths.find(name, "missions", suffix)
+    mission = missions.load(path)
     return msgspec.structs.replace(mission, name=mission.name or path.stem)
 
 
 def _planner(args: Args) -> Planner:
-    from moonteam.evaluation.decode import parse
     from sim2grid.brains import make_planner
 
-    parse(args.decode)
     policy = None
     if args.planner == "policy":
         policy = paths.find(args.policy, "policies", ".safetensors")
@@ -127,12 +185,12 @@ def _planner(args: Args) -> Planner:
                         decode=args.decode)
 
 
-def _grid_plan(args: Args, prepared: Prepared, planner: Planner) -> GridPlan:
+def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:
     """The planner on the grid alone. Raises InputError if it cannot serve this mission."""
     from sim2grid.metrics import GridPlan
     from sim2grid.replan import grid_trace
 
-    trace = grid_trace(prepared.scenario, planner, args.seed)
+    trace = grid_trace(prepared.scenario, planner, seed)
     return GridPlan(trace.complete, trace.makespan, trace.moves)
 
 
@@ -141,40 +199,42 @@ def _make_folder(out: Path, args: Args, mission: Mission) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("--out", f"{out} cannot be made: {error.strerror}") from None
-    for name in ("video.mp4", "map.mp4", "paths.png", "report.json", "timing.json"):
+    for name in ("video.mp4", "map.mp4", "paths.png", "report.json", "timing.json",
+                 "report.html"):
         (out / name).unlink(missing_ok=True)  # of an earlier run
     options = {key: value for key, value in asdict(args).items() if key not in ("out", "json")}
     files.write_json(out / "config.json", {
         "moonteam": __version__, "options": options, "mission": msgspec.to_builtins(mission)})
 
 
-def _execution(args: Args, prepared: Prepared, planner: Planner) -> Execution:
-    from sim2grid.execute import Execution
-
-    return Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
-                     prepared.frame, seed=args.seed, mode=args.mode)
-
-
-def _drive(args: Args, prepared: Prepared, execution: Execution) -> dict[str, float]:
+def _drive(args: Args, made: Run) -> dict[str, float]:
     """Runs the physics; returns wall-clock times. Raises KeyboardInterrupt when stopped."""
     from moonteam.physics.backends import make_backend
     from sim2grid.drive import run as run_executions
 
-    _say(f"compiling the {args.backend} physics "
-               "(kept for later runs; the first time takes longest)")
-    backend = make_backend(args.backend, prepared.scene)
+    execution, prepared = made.execution, made.prepared
+    _say(f"compiling the {made.backend} physics "
+         "(kept for later runs; the first time takes longest)")
+    backend = make_backend(made.backend, prepared.scene)
     begun = time.perf_counter()
     looks: list[float] = []
-    total = len(execution.record.targets)
-    with _bar("mission", total) as update:
+    with contextlib.ExitStack() as open_until:
+        update = open_until.enter_context(_bar("mission", len(execution.record.targets)))
+        show = None
+        if args.viewer:
+            from sim2grid.viewer import LiveView
+
+            show = open_until.enter_context(LiveView(prepared, backend.log_every)).show
 
         def look() -> None:
             looks.append(time.perf_counter())
             solved = int(execution.snapshot.solved.sum())
             update(solved, f"{execution.time:.1f} s, decision {execution.decision}, "
                            f"{solved} of {len(execution.record.targets)} targets")
+            if show:
+                show(execution)
 
-        run_executions([execution], backend, prepared.scene.qpos0, look)
+        run_executions([execution], backend, made.start, look, width=made.width, rows=[made.row])
     if not looks:
         return {"compile_s": 0.0, "wall_s": time.perf_counter() - begun}
     running = looks[-1] - looks[0]
@@ -183,27 +243,42 @@ def _drive(args: Args, prepared: Prepared, execution: Execution) -> dict[str, fl
             "real_time_factor": round(simulated / max(running, 1e-9), 3)}
 
 
-def _report(args: Args, prepared: Prepared, execution: Execution,
-            plan: GridPlan) -> Report:
+def _report(made: Run) -> Report:
     from sim2grid.metrics import make_report
     from sim2grid.slip import ground_height
 
-    objective = None if args.planner == "policy" else args.objective
+    prepared = made.prepared
     return make_report(
-        execution.record, prepared.mission, prepared.frame, prepared.bases,
-        planner=args.planner, objective=objective, mode=args.mode, backend=args.backend,
-        seed=args.seed, grid_plan=plan,
+        made.execution.record, prepared.mission, prepared.frame, prepared.bases,
+        planner=made.who, objective=made.objective, mode=made.execution.mode,
+        backend=made.backend, seed=made.seed, grid_plan=made.plan,
         height=ground_height(prepared.site.heights, prepared.site.spacing))
 
 
-def _film(args: Args, prepared: Prepared, execution: Execution) -> Film:
+def _film(made: Run) -> Film:
     from sim2grid.film import Film
     from sim2grid.picture import Ground
 
-    who = args.planner if args.planner != "policy" else f"policy {Path(args.policy).stem}"
-    return Film(prepared.mission, execution.record, prepared.frame,
+    prepared = made.prepared
+    return Film(prepared.mission, made.execution.record, prepared.frame,
                 Ground(prepared.site.heights, prepared.site.spacing), prepared.bases,
-                f"{prepared.mission.name}: {who}", prepared.barred())
+                made.title, prepared.barred())
+
+
+def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], out: Path,
+               video: Path | None) -> None:
+    """report.html: everything on one page."""
+    import yaml
+
+    from sim2grid import page, plots
+
+    mission = msgspec.to_builtins(made.prepared.mission)
+    page.write(out / "report.html", page.rollout_page(
+        report, command=made.command, made=video, out=out, timing=timing,
+        replans=[(round(r.time_s, 1), r.decision, r.words) for r in film.story.replans],
+        plots=[("Who did what when", plots.timeline(film.story)),
+               ("Motion", plots.motion(film.story, film.bases))],
+        mission=yaml.safe_dump(mission, sort_keys=False, default_flow_style=None)))
 
 
 def _save_paths(film: Film, out: Path) -> None:
@@ -280,4 +355,4 @@ def _show(report: Report, timing: dict[str, float], out: Path, video: Path | Non
     if "real_time_factor" in timing:
         print(f"  {timing['compile_s']:.1f} s to compile, then "
               f"{timing['real_time_factor']:.1f} times real time")
-    print(f"  {video or out / 'report.json'}")
+    print(f"  {out / 'report.html'}" + (f", {video}" if video else ""))

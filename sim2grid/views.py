@@ -144,22 +144,22 @@ class SceneViews:
         """A diamond on the ground, wide enough to show around the robot that stands in it."""
         reach = 0.48 * self.film.frame.cell_m
         corners = reach * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1]])
-        return path(on_ground(self.scene, xy[None] + corners, 0.05), _rgba(REPLAN), 0.035)
+        return path(on_ground(self.scene, xy[None] + corners, 0.05), rgba(REPLAN), 0.035)
 
     def _target_markers(self, target: int) -> dict[bool, list[Marker]]:
         """The target's markers, open and solved."""
         frame, spec = self.film.frame, self.film.record.targets[target]
         centre = frame.centre(np.array(spec.at, float))
         return {state: [
-            *square(self.scene, centre, 0.92 * frame.cell_m, _rgba(color), 0.035 * frame.cell_m),
-            *post(self.scene, centre, _rgba(color), height=0.9)]
+            *square(self.scene, centre, 0.92 * frame.cell_m, rgba(color), 0.035 * frame.cell_m),
+            *post(self.scene, centre, rgba(color), height=0.9)]
             for state, color in ((False, OPEN), (True, SOLVED))}
 
     def _goal(self, robot: int, goal: npt.NDArray) -> list[Marker]:
         key = (robot, round(float(goal[0]), 3), round(float(goal[1]), 3))
         if key not in self._goals:
             self._goals[key] = square(self.scene, goal, 0.3 * self.film.frame.cell_m,
-                                      _rgba(robot_color(robot)), 0.02)
+                                      rgba(robot_color(robot)), 0.02)
         return self._goals[key]
 
     def _trail(self, robot: int) -> tuple[npt.NDArray, list[Marker]]:
@@ -173,9 +173,10 @@ class SceneViews:
         if self.prepared.bodies[robot].flies:
             base = self.prepared.bodies[robot].base
             points[:, 2] = self.film.qpos[keep, base + 2]
-        return self.film.times[keep], path(points, _rgba(robot_color(robot), 0.8), 0.03)
+        return self.film.times[keep], path(points, rgba(robot_color(robot), 0.8), 0.03)
 
 
-def _rgba(color: Color, alpha: float = 1.0) -> Rgba:
+def rgba(color: Color, alpha: float = 1.0) -> Rgba:
+    """A colour as MuJoCo takes it."""
     red, green, blue = (value / 255 for value in color)
     return red, green, blue, alpha
