@@ -9,7 +9,6 @@ import pytest
 from moonteam import cli
 from moonteam.errors import InputError
 from moonteam.physics import traverse
-from moonteam.physics.scene import Placement, build_scene
 from moonteam.robots import KINDS
 from moonteam.terrain.site import Boulder, Site
 
@@ -110,18 +109,6 @@ def test_command_prints_one_document_and_writes_files(capsys, tmp_path):
     assert summary["cross_track_rms_m"] < 0.15
     assert json.loads((tmp_path / "traverse.json").read_text()) == report
     assert len((tmp_path / "traverse.csv").read_text().splitlines()) == 4
-
-
-def test_film(tmp_path):
-    render = pytest.importorskip("moonteam.physics.render")
-    place, route = site(), traverse.Route((0.0, 0.0), (3.0, 0.0), 0.0)
-    scene = build_scene(place, [Placement("robot", KINDS["drone"], route.start)])
-    recording = traverse.Recording(scene, route, np.tile(scene.qpos0, (3, 1)))
-    try:
-        traverse.film(recording, tmp_path / "drone.mp4", 160, 120)
-    except render.RenderingUnavailable as error:
-        pytest.skip(str(error))
-    assert (tmp_path / "drone.mp4").stat().st_size > 1000
 
 
 def test_bad_options_give_one_line(capsys):

@@ -14,7 +14,8 @@ from moonteam.errors import InputError
 from moonteam.files import dump_json, replacing, write_json
 
 if TYPE_CHECKING:
-    from moonteam.physics.traverse import Traverse
+    from moonteam.physics.film import Shot
+    from moonteam.physics.traverse import Recording, Traverse
 
 EXTENT = 26.0
 """Side of the sites beyond the length of a traverse, m."""
@@ -31,7 +32,7 @@ class Args:
     Examples:
       moonteam evaluate traverse --kind wheeled --site mare
       moonteam evaluate traverse --site highland --count 50 --out runs/traverse
-      moonteam evaluate traverse --site crater_rim --count 1 --video --out runs/rim
+      moonteam evaluate traverse --site crater_rim --count 20 --video --out runs/rim
     """
 
     kind: tuple[Literal["drone", "legged", "wheeled"], ...] = ("drone", "legged", "wheeled")
@@ -65,7 +66,8 @@ class Args:
     """folder for traverse.json and traverse.csv"""
 
     video: bool = False
-    """film the first traverse of each kind as KIND.mp4; needs --out"""
+    """film each kind on the highest rim, by the most boulders and on the steepest slope, as
+    KIND-rim.mp4 and so on, with a contact sheet; needs --out"""
 
 
 def run(args: Args) -> int:
@@ -81,9 +83,9 @@ def run(args: Args) -> int:
     enable_cache()
     from moonteam.physics.traverse import summarise
 
-    summaries, rows = [], []
+    summaries, rows, stills = [], [], []
     for kind in dict.fromkeys(args.kind):
-        mine, draws = _run_kind(args, kind)
+        mine, draws = _run_kind(args, kind, stills)
         summaries.append(summarise(mine) | {"route_draws": draws})
         rows += mine
     report = {"site": args.site, "seeds": list(_seeds(args)), "length_m": args.length,
@@ -91,6 +93,10 @@ def run(args: Args) -> int:
     if args.out:
         write_json(args.out / "traverse.json", report)
         _write_csv(args.out / "traverse.csv", rows)
+        if stills:
+            from moonteam.physics.film import contact_sheet
+
+            contact_sheet(stills, args.out / "sheet.png")
     if args.markdown:
         print(_markdown(args, summaries))
     else:
@@ -102,33 +108,52 @@ def _seeds(args: Args) -> range:
     return range(args.seed, args.seed + min(args.sites, args.count))
 
 
-def _run_kind(args: Args, name: str) -> tuple[list[Traverse], int]:
-    """All traverses of one kind and how many routes were drawn for them."""
+def _run_kind(args: Args, name: str, stills: list) -> tuple[list[Traverse], int]:
+    """All traverses of one kind and how many routes were drawn for them.
+
+    Films some if asked to and adds their pictures to `stills`.
+    """
     import numpy as np
 
-    from moonteam.physics.render import RenderingUnavailable
-    from moonteam.physics.traverse import draw_routes, film, run_traverses
+    from moonteam.physics.film import choose
+    from moonteam.physics.traverse import draw_routes, run_traverses
     from moonteam.robots import KINDS
     from moonteam.terrain.site import make_site
 
-    rows, total = [], 0
+    places, total = [], 0
     seeds = _seeds(args)
     for index, seed in enumerate(seeds):
         share = args.count // len(seeds) + (index < args.count % len(seeds))
         site = make_site(args.site, seed, args.length + EXTENT)
         rng = np.random.default_rng([args.seed, seed])
         routes, draws = draw_routes(KINDS[name], site, share, args.length, rng)
+        places.append((site, routes))
         total += draws
-        with _watched(f"{name} on {args.site} {seed}") as watch:
-            found, recording = run_traverses(
-                KINDS[name], site, routes, backend=args.backend, watch=watch)
+    rows = []
+    shots = choose(places) if args.video else []
+    for place, (site, routes) in enumerate(places):
+        mine = [shot for shot in shots if shot.place == place]
+        with _watched(f"{name} on {args.site} {site.seed}") as watch:
+            found, recordings = run_traverses(
+                KINDS[name], site, routes, backend=args.backend, watch=watch,
+                record=[shot.route for shot in mine])
         rows += found
-        if args.video and args.out and index == 0:
-            try:
-                film(recording, args.out / f"{name}.mp4")
-            except RenderingUnavailable as error:
-                print(f"moonteam: no video: {error}", file=sys.stderr)
+        for shot, recording in zip(mine, recordings, strict=True):
+            _film(args, name, shot, recording, stills)
     return rows, total
+
+
+def _film(args: Args, name: str, shot: Shot, recording: Recording, stills: list) -> None:
+    """One film; a line on standard error where nothing can be rendered."""
+    from moonteam.physics.film import film
+    from moonteam.physics.render import RenderingUnavailable
+
+    assert args.out is not None
+    try:
+        stills.append(film(recording, args.out / f"{name}-{shot.event}.mp4",
+                           event=shot.event, along=shot.along))
+    except RenderingUnavailable as error:
+        print(f"moonteam: no video: {error}", file=sys.stderr)
 
 
 @contextlib.contextmanager

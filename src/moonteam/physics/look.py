@@ -14,6 +14,9 @@ from moonteam.terrain.site import Site
 SUN_AZIMUTH, SUN_ELEVATION = math.radians(215.0), math.radians(28.0)
 """Where the sunlight comes from; low, so that relief shows."""
 
+SUN_DISTANCE = 30.0
+"""From where a picture looks to the sun's place in it, m; its light is parallel."""
+
 TEXELS = 512
 """Side of the ground's texture, pixels."""
 
@@ -49,7 +52,7 @@ def _light(spec: mujoco.MjSpec) -> None:
         math.cos(SUN_ELEVATION) * math.sin(SUN_AZIMUTH), math.sin(SUN_ELEVATION)])
     spec.worldbody.add_light(
         name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=direction,
-        pos=-30 * direction, diffuse=[1.25, 1.23, 1.17], specular=[0.15, 0.15, 0.15],
+        pos=-SUN_DISTANCE * direction, diffuse=[1.25, 1.23, 1.17], specular=[0.15, 0.15, 0.15],
         ambient=[0, 0, 0], castshadow=True)
     spec.visual.headlight.ambient = [0.17, 0.17, 0.19]
     spec.visual.headlight.diffuse = [0.13, 0.13, 0.14]

@@ -58,12 +58,14 @@ class Renderer:
       width, height: pixels.
       shadows: cast by the sun; several times dearer without a GPU.
       samples: of multisampling; 0 is the cheapest.
+      shadow_reach: shadows fall only this far, m, around where the camera looks, and are the
+        sharper for it; 0: everywhere.
 
     Raises RenderingUnavailable.
     """
 
     def __init__(self, scene: Scene, width: int, height: int, *, shadows: bool = False,
-                 samples: int = 4):
+                 samples: int = 4, shadow_reach: float = 0.0):
         spec = scene.spec.copy()
         look.decorate(spec, scene.site)
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
@@ -73,6 +75,9 @@ class Renderer:
         set_heights(self._model, scene.site.heights)
         look.mesh_offsets(self._model, scene.site)
         self._data = mujoco.MjData(self._model)
+        self._follow_shadow = shadow_reach > 0.0
+        if self._follow_shadow:
+            self._model.vis.map.shadowclip = shadow_reach / self._model.stat.extent
         self._window = _open_window(width, height)
         atexit.register(self.close)
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -89,8 +94,8 @@ class Renderer:
         self._option.flags[mujoco.mjtVisFlag.mjVIS_STATIC] = True
 
     def frame(self, qpos: Points, camera: mujoco.MjvCamera | None = None,
-              markers: Sequence[Marker] = ()) -> npt.NDArray[np.uint8]:
-        """The picture [height, width, 3] of a pose qpos [nq].
+              markers: Sequence[Marker] = (), words: str = "") -> npt.NDArray[np.uint8]:
+        """The picture [height, width, 3] of a pose qpos [nq], with `words` in a corner.
 
         Without a camera: one that sees all robots.
         """
@@ -101,12 +106,18 @@ class Renderer:
         mujoco.mj_camlight(self._model, self._data)
         if camera is None:
             camera = overview(self.scene, qpos, aspect=self.width / self.height)
+        if self._follow_shadow:
+            sun = self._data.light_xdir[0]
+            self._data.light_xpos[0] = np.asarray(camera.lookat) - look.SUN_DISTANCE * sun
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, camera,
                                mujoco.mjtCatBit.mjCAT_ALL, self._drawn)
         for marker in markers:
             self._draw(marker)
         port = mujoco.MjrRect(0, 0, self.width, self.height)
         mujoco.mjr_render(port, self._drawn, self._context)
+        if words:
+            mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT,
+                               port, words, "", self._context)
         picture = np.empty((self.height, self.width, 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, port, self._context)
         return picture[::-1]

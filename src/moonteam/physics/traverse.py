@@ -11,14 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.files import replacing
 from moonteam.physics.backends import make_backend
 from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
@@ -126,8 +124,9 @@ def _passable(kind: RobotKind, site: Site, start: np.ndarray, goal: np.ndarray) 
 def run_traverses(
     kind: RobotKind, site: Site, routes: Sequence[Route], *, backend: str = "native",
     threads: int = 0, watch: Callable[[float], None] = lambda seconds: None,
-) -> tuple[list[Traverse], Recording]:
-    """Runs all routes at once; returns a row each, and the first one's poses.
+    record: Sequence[int] = (),
+) -> tuple[list[Traverse], list[Recording]]:
+    """Runs all routes at once; returns a row each, and the poses of those in `record`.
 
     Args:
       kind: which robot.
@@ -136,6 +135,7 @@ def run_traverses(
       backend: `native` or `mjx`.
       threads: of the native backend, 0 for all CPUs.
       watch: called with the simulated seconds so far.
+      record: numbers of the routes whose poses are wanted.
     """
     starts = [Placement("robot", kind, r.start, r.yaw) for r in routes]
     scene = build_scene(site, starts[:1])
@@ -151,13 +151,14 @@ def run_traverses(
         state, log = engine.advance(state, command, chunk)
         judge.add(np.asarray(log.qpos), np.asarray(log.power), np.asarray(log.propellant_rate),
                   np.asarray(state.diverged))
-        poses.append(np.asarray(log.qpos[0]))
+        poses.append(np.asarray(log.qpos)[list(record)])
         watch(judge.seconds)
         if judge.done:
             break
     rows = judge.verdicts()
-    until = round((rows[0].seconds + REST_SECONDS) / SAMPLE_SECONDS)
-    return rows, Recording(scene, routes[0], np.concatenate(poses)[:until])
+    whole = np.concatenate(poses, axis=1)
+    until = [round((rows[r].seconds + REST_SECONDS) / SAMPLE_SECONDS) for r in record]
+    return rows, [Recording(scene, routes[r], whole[i, :until[i]]) for i, r in enumerate(record)]
 
 
 class _Judge:
@@ -242,31 +243,6 @@ class _Judge:
             energy_j_per_m=float(power[:end].sum() * SAMPLE_SECONDS / max(progress, 0.1)),
             propellant_g=float(propellant[:end].sum() * SAMPLE_SECONDS * 1000.0),
             tilt_p95_deg=float(np.percentile(tilt[:end], 95)), tilt_max_deg=float(tilt[:end].max()))
-
-
-def film(recording: Recording, path: Path, width: int = 640, height: int = 480) -> None:
-    """Writes an MP4: a camera flies along, a post marks the goal, a line the way.
-
-    A slow robot is shown up to four times faster, at 25 frames a second.
-    Raises RenderingUnavailable without off-screen OpenGL.
-    """
-    import imageio_ffmpeg
-    import mediapy
-
-    from moonteam.physics import render
-
-    scene, route, qpos = recording
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    share = np.linspace(0.0, 1.0, 41)[:, None]
-    line = np.array(route.start) + share * (np.array(route.goal) - np.array(route.start))
-    markers = render.path(render.on_ground(scene, line, 0.03), (0.9, 0.7, 0.1, 1.0))
-    markers += render.post(scene, np.array(route.goal), (0.1, 0.8, 0.3, 1.0))
-    faster = min(4, max(1, round(len(qpos) * SAMPLE_SECONDS / 15.0)))
-    with (replacing(path) as temporary, render.Renderer(scene, width, height) as renderer,
-          mediapy.VideoWriter(temporary, (height, width), fps=1.0 / SAMPLE_SECONDS) as writer):
-        for pose in qpos[::faster]:
-            camera = render.follow(pose[:3], distance=3.0, azimuth=120.0, elevation=-22.0)
-            writer.add_image(renderer.frame(pose, camera, markers))
 
 
 def summarise(rows: Sequence[Traverse]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from moonteam.compilation import enable_cache
 from moonteam.physics.scene import FRICTION, Placement, Scene, build_scene, start_pose
 from moonteam.robots.base import CONTROL_PERIOD, PHYSICS_DT, Command
 from moonteam.robots.legged import GAIT, LEGGED, Gait, LeggedState, control_with
-from moonteam.terrain.site import SPACING, Site, make_site
+from moonteam.terrain.site import SPACING, Site, make_site, rough_ground
 
 FALLEN = math.cos(math.radians(60.0))
 ARRIVED = 0.15  # m from the goal
@@ -132,16 +132,6 @@ def _control(
 _CONTROL = jax.jit(jax.vmap(_control, in_axes=(0, 0, 0, 0, 0, None)))
 
 
-def roughness(shape: tuple[int, int], rms: float, seed: int, spacing: float) -> np.ndarray:
-    """Self-affine heights [ny, nx] m of that rms: amplitude ~ 1 / wavelength^1.5 above 8 m."""
-    wave = [np.fft.fftfreq(n, spacing) for n in shape]
-    size = np.hypot(*np.meshgrid(*wave, indexing="ij"))
-    gain = np.where(size > 0, 1.0 / np.maximum(size, 1 / 8) ** 1.5, 0.0)
-    noise = np.random.default_rng(seed).standard_normal(shape)
-    heights = np.fft.ifft2(np.fft.fft2(noise) * gain).real
-    return heights / heights.std() * rms
-
-
 def site_of(heights: np.ndarray, name: str, spacing: float = SPACING) -> Site:
     """Plain ground of one's own elevations [ny, nx] m."""
     return Site(name, 0, heights.astype(np.float32), spacing)
@@ -160,7 +150,7 @@ def course(seed: int) -> Site:
         rows = lane == n
         word, _, number = name.partition(" ")
         rms = {"flat": 0.0, "rough": 0.04, "very": 0.07}.get(word, 0.02)
-        ground = roughness(shape, rms, seed * 100 + n, SPACING) if rms else np.zeros(shape)
+        ground = rough_ground(shape, rms, seed * 100 + n, SPACING) if rms else np.zeros(shape)
         if word in ("up", "down"):
             ramp = math.tan(math.radians(float(number))) * (1 if word == "up" else -1)
             ground = ground + ramp * np.clip(x + 3.0, 0.0, 6.0)[None, :]
@@ -269,7 +259,7 @@ def evaluate(
     parts: list[Walks] = []
     for seed in seeds:
         if ground == "rough":
-            site = site_of(roughness((161, 161), 0.04, seed, SPACING), "rough")
+            site = site_of(rough_ground((161, 161), 0.04, seed, SPACING), "rough")
         else:
             site = make_site(ground, seed, 40.0)
         ends = traverses(site, per_site, 20.0, np.random.default_rng(seed))

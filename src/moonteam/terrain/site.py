@@ -125,6 +125,16 @@ def make_site(
     return replace(site, boulders=tuple(_boulders(site, rocks)), meta=meta)
 
 
+def rough_ground(shape: tuple[int, int], rms: float, seed: int, spacing: float) -> np.ndarray:
+    """Self-affine heights [ny, nx] m of that rms: amplitude ~ 1 / wavelength^1.5 above 8 m."""
+    wave = [np.fft.fftfreq(n, spacing) for n in shape]
+    size = np.hypot(*np.meshgrid(*wave, indexing="ij"))
+    gain = np.where(size > 0, 1.0 / np.maximum(size, 1 / 8) ** 1.5, 0.0)
+    noise = np.random.default_rng(seed).standard_normal(shape)
+    heights = np.fft.ifft2(np.fft.fft2(noise) * gain).real
+    return heights / heights.std() * rms
+
+
 def for_mission(mission: Mission, spacing: float = SPACING) -> Site:
     """The ground that a mission asks for: its map plus a margin, map centre = site centre."""
     width, height = (n * mission.map.cell_m + 2 * MARGIN for n in mission.map.size)

@@ -1,0 +1,119 @@
+"""`moonteam evaluate slopes`: how steep each kind of robot can go, up, down and across."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from moonteam.errors import InputError
+from moonteam.files import dump_json, write_json
+
+
+@dataclass(frozen=True)
+class Args:
+    """Straight drives up, down and across planes of a known slope, smooth and rough.
+
+    Each drive is 13 m, 8 of them on the plane. A rover refuses a slope by standing still
+    before it, which counts as stuck. Means are over drives that arrived.
+
+    Examples:
+      moonteam evaluate slopes --kind legged
+      moonteam evaluate slopes --kind wheeled --degrees 15 20 --roughness 0 --json
+    """
+
+    kind: tuple[Literal["drone", "legged", "wheeled"], ...] = ("legged", "wheeled")
+    """which kinds of robot"""
+
+    degrees: tuple[float, ...] = (0.0, 12.0, 15.0, 20.0)
+    """slopes of the plane"""
+
+    roughness: tuple[float, ...] = (0.0, 0.04)
+    """rms height of relief laid over the plane, m"""
+
+    count: int = 8
+    """drives of each kind, slope, way and roughness"""
+
+    seed: int = 0
+    """of the relief and of the drives' places"""
+
+    json: bool = False
+    """print one JSON document and nothing else"""
+
+    markdown: bool = False
+    """print the table for a page of docs, with command, commit and machine"""
+
+    out: Path | None = None
+    """folder for slopes.json"""
+
+
+def run(args: Args) -> int:
+    """Measures; always 0, since to refuse a slope is no failure."""
+    _check(args)
+    from moonteam.compilation import enable_cache
+
+    enable_cache()
+    from moonteam.physics.slopes import measure
+    from moonteam.robots import KINDS
+
+    rows = [row for kind in dict.fromkeys(args.kind) for roughness in args.roughness
+            for degrees in args.degrees
+            for row in measure(KINDS[kind], degrees, roughness, args.count, args.seed)]
+    report = {"seed": args.seed, "rows": rows}
+    if args.out:
+        write_json(args.out / "slopes.json", report)
+    if args.markdown:
+        print(_markdown(args, rows))
+    else:
+        print(dump_json(report, 2) if args.json else _table(rows))
+    return 0
+
+
+def _check(args: Args) -> None:
+    if args.count < 1:
+        raise InputError("--count", "must be at least 1")
+    if args.seed < 0:
+        raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
+    for name, values, most in (("--degrees", args.degrees, 40.0),
+                               ("--roughness", args.roughness, 0.2)):
+        for value in values:
+            if not 0.0 <= value <= most:
+                raise InputError(name, f"{value:g} is not allowed; 0 to {most:g}")
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    """A row's entries, as text."""
+    head = [row["kind"], f"{100 * row['roughness_m']:g}", f"{row['degrees']:g}", row["way"],
+            f"{row['arrived']} of {row['count']}", str(row["fallen"] + row["diverged"]),
+            str(row["stuck"] + row["late"]), f"{row['farthest_m']:.1f}"]
+    if not row["arrived"]:
+        return [*head, "-", "-", "-", "-"]
+    return [*head, f"{row['speed_mps']:.2f}", f"{row['cross_track_p95_m']:.3f}",
+            f"{row['tilt_max_deg']:.1f}", f"{row['energy_j_per_m']:.1f}"]
+
+
+COLUMNS = ("kind", "rms, cm", "slope, deg", "way", "arrived", "fell", "stuck", "farthest, m",
+           "speed, m/s", "cross p95, m", "tilt max, deg", "energy, J/m")
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    table = [list(COLUMNS), *(_cells(row) for row in rows)]
+    widths = [max(len(line[i]) for line in table) for i in range(len(COLUMNS))]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+                     for line in table)
+
+
+def _markdown(args: Args, rows: list[dict[str, Any]]) -> str:
+    from moonteam.evaluation import provenance
+
+    def words(values: tuple[float, ...]) -> str:
+        return " ".join(f"{v:g}" for v in values)
+
+    command = (f"moonteam evaluate slopes --kind {' '.join(args.kind)} "
+               f"--degrees {words(args.degrees)} --roughness {words(args.roughness)} "
+               f"--count {args.count} --seed {args.seed}")
+    lines = [f"`{command}`", "", "| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
+    return "\n".join([*lines, "", "- Means are over arrivals; farthest: the most any drive got "
+                      "of its 13 m, whose slope begins at 2.5 m.",
+                      f"- {provenance.hardware_line(provenance.meta(command, args.seed))}"])
