@@ -140,7 +140,6 @@ class Group:
 
     def __init__(self, evaluation: Evaluation, fleet: Fleet, first: int):
         self._all, self._fleet, self._first = evaluation, fleet, first
-        self._rules = Rules()
         self._height = ground_height(fleet.site.heights, fleet.site.spacing)
         self._width = min(evaluation.width, len(fleet.missions))
         self._engine: Backend | None = None
@@ -192,7 +191,7 @@ class Group:
                    route: Route | None) -> Execution:
         fleet = self._fleet
         return Execution(fleet.missions[k], fleet.scenarios[k], make(), fleet.bodies, fleet.frame,
-                         seed=self._seed(k), mode=contender.mode, rules=self._rules, route=route)
+                         seed=self._seed(k), mode=contender.mode, route=route)
 
     def _seed(self, k: int) -> int:
         return self._all.seed + self._first + k
@@ -220,15 +219,15 @@ class Group:
         events = events and any(mission.events for mission in self._fleet.missions)
         key = (contender.who, contender.objective, events)
         if key not in self._plans:
-            self._plans[key] = on_grid(self._fleet, make, self._rules, events,
-                                       [self._seed(k) for k in range(len(self._fleet.missions))])
+            seeds = [self._seed(k) for k in range(len(self._fleet.missions))]
+            self._plans[key] = on_grid(self._fleet, make, events, seeds)
         return self._plans[key]
 
 
-def on_grid(fleet: Fleet, make: Callable[[], Planner], rules: Rules, events: bool,
-            seeds: Sequence[int]) -> list[OnGrid]:
+def on_grid(fleet: Fleet, make: Callable[[], Planner], events: bool, seeds: Sequence[int]
+            ) -> list[OnGrid]:
     """What a planner makes of a fleet's missions without physics, with or without events."""
-    bodies = ideal_bodies(fleet.bodies)
+    bodies, rules = ideal_bodies(fleet.bodies), Rules()
     executions = []
     for k, mission in enumerate(fleet.missions):
         spec = mission if events else msgspec.structs.replace(mission, events=())

@@ -264,7 +264,11 @@ def _print(args: Args, report: dict[str, Any]) -> None:
     elif args.markdown:
         print(plain_markdown(report, tables(report)))
     else:
-        show_plain(report, tables(report))
+        (titles, rows), *more = tables(report)
+        heads = ["\n".join([row[0], " ".join(word for word in row[1:4] if word != "-")])
+                 for row in rows]
+        turned = [[title, *(row[k] for row in rows)] for k, title in enumerate(titles) if k > 3]
+        show_plain(report, [(["", *heads], turned), *more])
 
 
 def _say(text: str) -> None:
