@@ -41,7 +41,8 @@ class Args:
     planner: Many[tuple[str, ...]] = ()
     """exact, greedy, lns, exhaustive, cpsat or policy; again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
-    """makespan, moves or weighted; again for more rows. Default: makespan."""
+    """makespan, moves or weighted; again for more rows. Default: makespan, and for best-of-K
+    what the preference asks for."""
     policy: Many[tuple[str, ...]] = ()
     """Policy file (.safetensors) or the name of a bundled policy; again for more."""
     preference: Many[tuple[float, ...]] = ()
@@ -123,7 +124,7 @@ def options_of(args: Any) -> Any:
     from moonteam.evaluation.contenders import Options
 
     return Options(
-        planners=args.planner or ("exact",), objectives=args.objective or ("makespan",),
+        planners=args.planner or ("exact",), objectives=args.objective,
         policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
         preferences=args.preference, decodes=args.decode or ("argmax",),
         alpha=getattr(args, "alpha", 1.0), beta=getattr(args, "beta", 0.05),

@@ -36,7 +36,8 @@ class Options:
     """What a user asked for, as the commands hand it over; checked by `contenders`."""
 
     planners: Sequence[str]
-    objectives: Sequence[str] = ("makespan",)
+    objectives: Sequence[str] = ()
+    """Empty: planners least makespan, best-of-K what the preference asks for."""
     policies: Sequence[Path] = ()
     preferences: Sequence[float] = ()
     decodes: Sequence[str] = ("argmax",)
@@ -173,12 +174,15 @@ class Planned:
 
 @dataclass(frozen=True)
 class Learned:
-    """A policy; best-of-K keeps, of K sampled rollouts, the best by the objective."""
+    """A policy; best-of-K keeps, of K sampled rollouts, the best by the objective.
+
+    Without an objective it is the one of the preference p, (1 - p) * makespan + p * moves.
+    """
 
     name: str
     policy: Policy
     decode: Decode
-    objective: Objective
+    objective: Objective | None
     preference: float
     options: Options
 
@@ -190,7 +194,8 @@ class Learned:
     def run(self, world: World) -> Outcomes:
         """See `Contender`."""
         options = self.options
-        prices = rollouts.price(self.objective, options.alpha, options.beta)
+        prices = (rollouts.price(self.objective, options.alpha, options.beta) if self.objective
+                  else rollouts.wish(self.preference))
         tries = rollouts.run(self.policy, world, self.decode, self.preference, options.seed,
                              self.name, prices, options.alone)
         choice = rollouts.best(tries, prices)
@@ -221,11 +226,12 @@ def contenders(options: Options) -> list[Contender]:
     for objective in options.objectives:
         if objective not in OBJECTIVES:
             raise InputError("--objective", f"{objective!r} is not one of {', '.join(OBJECTIVES)}")
-    objectives: list[Objective] = [OBJECTIVES[o] for o in dict.fromkeys(options.objectives)]
+    given: list[Objective] = [OBJECTIVES[o] for o in dict.fromkeys(options.objectives)]
+    objectives: list[Objective] = given or ["makespan"]
     found: list[Contender] = []
     for planner in dict.fromkeys(options.planners):
         if planner == "policy":
-            found += _policies(options, objectives)
+            found += _policies(options, given)
         elif planner in PLANNERS:
             found += [Planned(PLANNERS[planner](options, o), planner, o) for o in objectives]
         else:
@@ -256,9 +262,9 @@ def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contend
             for decode in decodes:
                 if decode.symmetric:
                     policy.symmetrised()
-                for objective in objectives if decode.rollouts > 1 else objectives[:1]:
+                for objective in objectives if decode.rollouts > 1 and objectives else [None]:
                     words = [decode.name]
-                    if decode.rollouts > 1 and len(objectives) > 1:
+                    if objective and len(objectives) > 1:
                         words.append(objective)
                     if given:
                         words.append(f"preference {preference:g}")

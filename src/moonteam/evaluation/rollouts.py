@@ -265,6 +265,11 @@ def price(objective: Objective, alpha: float = 1.0, beta: float = 0.05) -> tuple
     return {"makespan": (1.0, _TIE), "moves": (_TIE, 1.0), "weighted": (alpha, beta)}[objective]
 
 
+def wish(preference: float) -> tuple[float, float]:
+    """What a step and a move cost to a preference of 0 (time) to 1 (effort)."""
+    return 1.0 - preference + _TIE, preference + _TIE
+
+
 def run(policy: Policy, world: World, decode: Decode, preference: float, seed: int, title: str,
         prices: tuple[float, float] = (1.0, _TIE), alone: bool = False) -> Tries:
     """Plays every scenario `decode.rollouts` times.

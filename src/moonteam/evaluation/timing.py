@@ -150,7 +150,8 @@ def findings(rows: Sequence[dict]) -> list[str]:
                         f"(at {faster[-1]}: {_versus(exact_times, other, faster[-1])}).")
         if slower:
             said.append(f"The exact planner (makespan) takes longer than {what} at "
-                        f"{_list(slower)} targets (at {slower[0]}: {_versus(exact_times, other, slower[0])}).")
+                        f"{_list(slower)} targets (at {slower[0]}: "
+                        f"{_versus(exact_times, other, slower[0])}).")
     slow = _by_targets(rows, "exhaustive(makespan)")
     shared = sorted(slow.keys() & exact_times.keys())
     if shared:
