@@ -69,6 +69,20 @@ class RobotKind:
     control: Callable[[Any, Array, Array, Array, Command, Surface], tuple[Array, Any, Telemetry]]
 
 
+def times(matrix: Array, vector: Array) -> Array:
+    """Matrices [..., n, k] times vectors [..., k], as sums: [..., n].
+
+    For matrices this small a library call, which is what XLA makes of `@` on a CPU, costs more
+    than the arithmetic, and it cannot be fused with what stands around it.
+    """
+    return jnp.sum(matrix * vector[..., None, :], axis=-1)
+
+
+def turned(matrix: Array, vectors: Array) -> Array:
+    """One matrix [n, k] times each of vectors [L, k]: [L, n]. See `times`."""
+    return jnp.sum(matrix[None] * vectors[:, None, :], axis=-1)
+
+
 def quat_rotate(quat: Array, vector: Array) -> Array:
     """Rotates a body-frame vector [3] into the world by a unit quaternion wxyz [4]."""
     w, u = quat[0], quat[1:]

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from moonteam.paths import assets
-from moonteam.robots.base import GRAVITY, Command, RobotKind, Telemetry, quat_matrix
+from moonteam.robots.base import GRAVITY, Command, RobotKind, Telemetry, quat_matrix, times
 from moonteam.robots.path import Offset, Path, braking_speed, measure, start_path, update_path
 from moonteam.terrain.surface import Surface
 
@@ -140,7 +140,7 @@ def _wrench(
     """Collective thrust [] N and body torque [3] N m that point the thrust along force [3] N."""
     rotation = quat_matrix(qpos[3:7] / (jnp.linalg.norm(qpos[3:7]) + 1e-9))
     size = jnp.sqrt(jnp.sum(force**2) + 1e-12)
-    wanted = rotation.T @ (force / size)
+    wanted = times(rotation.T, force / size)
     # Sine of the tilt error about body x and y, kept at full size when upside down.
     tilt = jnp.stack([-wanted[1], wanted[0]])
     tilt = jnp.where(wanted[2] > 0.0, tilt, tilt / (jnp.linalg.norm(tilt) + 1e-6))

@@ -30,6 +30,8 @@ from moonteam.robots.base import (
     RobotKind,
     Telemetry,
     quat_matrix,
+    times,
+    turned,
 )
 from moonteam.terrain.surface import Surface
 
@@ -139,7 +141,7 @@ def leg_kinematics(angles: Array) -> tuple[Array, Array]:
 def init(qpos: Array, qvel: Array) -> LeggedState:
     """Standing still, feet where the joint angles put them, the clock where all carry."""
     feet, _ = leg_kinematics(qpos[7:].reshape(4, 3))
-    grip = qpos[None, :3] + feet @ quat_matrix(qpos[3:7]).T
+    grip = qpos[None, :3] + turned(quat_matrix(qpos[3:7]), feet)
     phase = jnp.asarray((GAIT.duty - 0.5) / 2.0)
     return LeggedState(phase, grip, jnp.zeros(3), jnp.array(True))
 
@@ -169,7 +171,7 @@ def control_with(
     state, swing, progress = _clock(gait, state, body)
     foothold = _footholds(gait, state, body, swing, progress, surface)
     forces = _stance_forces(gait, state, body, swing)
-    torque = jnp.einsum("lij,li->lj", body.jacobian, -forces)
+    torque = times(jnp.swapaxes(body.jacobian, 1, 2), -forces)
     torque = torque + _swing_torques(gait, state, body, swing, progress, foothold)
     torque = torque.reshape(12)
     torque = jnp.nan_to_num(torque)
@@ -182,16 +184,17 @@ def control_with(
 def _sense(gait: Gait, qpos: Array, qvel: Array, surface: Surface) -> _Body:
     quat = qpos[3:7] / (jnp.linalg.norm(qpos[3:7]) + 1e-9)
     rotation = quat_matrix(quat)
-    velocity, spin = qvel[:3], rotation @ qvel[3:6]
+    velocity, spin = qvel[:3], times(rotation, qvel[3:6])
     joint_velocity = qvel[6:].reshape(4, 3)
     feet, jacobian = leg_kinematics(qpos[7:].reshape(4, 3))
-    arms, jacobian = feet @ rotation.T, jnp.einsum("ij,ljk->lik", rotation, jacobian)
+    arms = turned(rotation, feet)
+    jacobian = jnp.sum(rotation[None, :, :, None] * jacobian[:, None, :, :], axis=2)
     feet = qpos[:3][None, :] + arms
     foot_velocity = velocity[None, :] + jnp.cross(spin[None, :], arms)
-    foot_velocity = foot_velocity + jnp.einsum("lij,lj->li", jacobian, joint_velocity)
+    foot_velocity = foot_velocity + times(jacobian, joint_velocity)
     ahead = rotation[:2, 0] / (jnp.linalg.norm(rotation[:2, 0]) + 1e-6)
     level = jnp.stack([ahead, jnp.stack([-ahead[1], ahead[0]])], axis=1)
-    under = qpos[:2][None, :] + _nominal(gait) @ level.T
+    under = qpos[:2][None, :] + turned(level, _nominal(gait))
     heights = surface.height(jnp.concatenate([under, feet[:, :2]]))
     plane, below = heights[:4], heights[4:]
     rise = jnp.stack([jnp.sum(plane * END) / gait.length, jnp.sum(plane * SIDE) / gait.stance])
@@ -199,7 +202,7 @@ def _sense(gait: Gait, qpos: Array, qvel: Array, surface: Surface) -> _Body:
     gap = (feet[:, 2] - below) * normal[:, 2] - FOOT_RADIUS
     return _Body(
         qpos[:3], rotation, velocity, spin, level, feet, foot_velocity, jacobian,
-        joint_velocity, jnp.mean(plane), level @ rise / 4.0, gap, normal,
+        joint_velocity, jnp.mean(plane), times(level, rise) / 4.0, gap, normal,
     )  # fmt: skip
 
 
@@ -214,7 +217,7 @@ def _guide(gait: Gait, state: LeggedState, body: _Body, command: Command) -> Leg
     distance = jnp.linalg.norm(way)
     near = jnp.where(state.holding, distance < LEFT, distance < ARRIVED)
     holding = near | (command.speed <= 0.0)
-    local = body.level.T @ way
+    local = times(body.level.T, way)
     error = jnp.where(distance > NEAR, jnp.arctan2(local[1], local[0]), 0.0)
     facing = jnp.clip(1.6 * jnp.cos(error) - 0.6, 0.0, 1.0)
     limit = jnp.minimum(command.speed, gait.speed)
@@ -234,7 +237,8 @@ def _clock(gait: Gait, state: LeggedState, body: _Body) -> tuple[LeggedState, Ar
     The clock rests where all feet carry while nothing is asked and the feet stand well.
     """
     asked = jnp.linalg.norm(state.wanted * jnp.array([1.0, 1.0, 0.25])) > 0.02
-    nominal = _nominal(gait) @ body.level.T + (body.at[:2] + gait.lean * body.gradient)[None, :]
+    nominal = turned(body.level, _nominal(gait))
+    nominal = nominal + (body.at[:2] + gait.lean * body.gradient)[None, :]
     astray = jnp.max(jnp.linalg.norm(body.feet[:, :2] - nominal, axis=1)) > 0.08
     pushed = jnp.linalg.norm(body.velocity[:2]) > 0.15
     offsets = jnp.asarray(LEG_OFFSETS)
@@ -253,10 +257,10 @@ def _footholds(
     gait: Gait, state: LeggedState, body: _Body, swing: Array, progress: Array, surface: Surface
 ) -> Array:
     """Where each foot's centre is to land [L, 3] m."""
-    hips = _nominal(gait) @ body.level.T + gait.lean * body.gradient[None, :]  # [L, 2]
-    turned = jnp.stack([-hips[:, 1], hips[:, 0]], axis=1)
-    wanted = state.wanted[None, :2] + state.wanted[2] * turned
-    velocity = body.velocity[None, :2] + body.spin[2] * turned
+    hips = turned(body.level, _nominal(gait)) + gait.lean * body.gradient[None, :]  # [L, 2]
+    aside = jnp.stack([-hips[:, 1], hips[:, 0]], axis=1)
+    wanted = state.wanted[None, :2] + state.wanted[2] * aside
+    velocity = body.velocity[None, :2] + body.spin[2] * aside
     stride = gait.period * gait.duty / 2.0
     left = (1.0 - progress) * (1.0 - gait.duty) * gait.period
     place = body.at[:2][None, :] + hips + wanted * stride + gait.catch * (velocity - wanted)
@@ -295,10 +299,10 @@ def _swing_torques(
     pull = gait.swing**2 * jnp.clip(target - body.feet, -0.1, 0.1)
     pull = pull + 1.6 * gait.swing * (velocity - body.foot_velocity)
     pull = pull + jnp.where(swing[:, None], push, 0.0)
-    square = jnp.einsum("lij,lkj->lik", body.jacobian, body.jacobian)
+    square = jnp.sum(body.jacobian[:, :, None, :] * body.jacobian[:, None, :, :], axis=3)
     square = square + NEAR_STRAIGHT * jnp.eye(3)[None]
-    joints = jnp.einsum("lij,li->lj", body.jacobian, _solve(square, pull))
-    torque = joints @ LEG_INERTIA
+    joints = times(jnp.swapaxes(body.jacobian, 1, 2), _solve(square, pull))
+    torque = turned(jnp.asarray(LEG_INERTIA, joints.dtype), joints)  # symmetric
     return jnp.where((swing | hanging)[:, None], torque, 0.0)
 
 
@@ -307,7 +311,7 @@ def _solve(matrix: Array, vector: Array) -> Array:
     a, b, c = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     det = jnp.sum(a * rows[:, 0], axis=1)
-    return jnp.einsum("lij,lj->li", rows, vector) / det[:, None]
+    return times(rows, vector) / det[:, None]
 
 
 def _standing(state: LeggedState) -> Array:
@@ -322,21 +326,21 @@ def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
     up = up / jnp.linalg.norm(up)
     feet = jnp.mean(body.feet[:, :2], axis=0) - body.at[:2] - gait.lean * body.gradient
     ends = jnp.sum(body.feet[:, :2] * END[:, None], axis=0) / 2.0
-    local = body.level.T @ ends
+    local = times(body.level.T, ends)
     standing = _standing(state)
     yaw = jnp.where(standing, jnp.arctan2(local[1], local[0]), 0.0)
     push = gait.velocity * (state.wanted[:2] - body.velocity[:2]) + DRAG * state.wanted[:2]
     push = push + jnp.where(standing, 8.0 * feet, 0.0)
     push = push / jnp.maximum(1.0, jnp.linalg.norm(push) / (gait.push * GRAVITY))
     rise = body.ground + gait.height - body.at[2]
-    climb = body.gradient @ body.velocity[:2] - body.velocity[2]
+    climb = jnp.sum(body.gradient * body.velocity[:2]) - body.velocity[2]
     lift = GRAVITY + gait.lift * jnp.clip(rise, -0.05, 0.05) + gait.lift_damping * climb
     lift = jnp.clip(lift, 0.2 * GRAVITY, 3.0 * GRAVITY)
     force = MASS * jnp.concatenate([push, lift[None]])
     tilt = jnp.cross(body.rotation[:, 2], up) + jnp.array([0.0, 0.0, 1.0]) * 0.3 * yaw
     spin = jnp.array([0.0, 0.0, 1.0]) * state.wanted[2] - body.spin
     twist = gait.attitude * tilt + gait.attitude_damping * spin
-    moment = body.rotation @ (INERTIA * (body.rotation.T @ twist))
+    moment = times(body.rotation, INERTIA * times(body.rotation.T, twist))
     return jnp.concatenate([force, moment])
 
 
@@ -353,9 +357,10 @@ def _stance_forces(gait: Gait, state: LeggedState, body: _Body, swing: Array) ->
     ease = jnp.where(_standing(state), 1.0, ease)
     touch = jnp.clip(1.0 - (body.gap - 0.004) / 0.012, 0.0, 1.0)
     weight = jnp.where(swing, 0.0, ease * touch)[:, None]  # [L, 1]
-    arms = body.feet - (body.at + body.rotation @ jnp.asarray(CENTRE, jnp.float32))[None, :]
+    arms = body.feet - (body.at + times(body.rotation, jnp.asarray(CENTRE, jnp.float32)))[None, :]
     total, lever = jnp.sum(weight) + SLACK, jnp.sum(weight * arms, axis=0)
-    second = (weight * arms).T @ arms - jnp.outer(lever, lever) / total
+    second = jnp.sum((weight * arms)[:, :, None] * arms[:, None, :], axis=0)
+    second = second - lever[:, None] * lever[None, :] / total
     schur = (jnp.trace(second) + SLACK * gait.moment) * jnp.eye(3) - second
     forces = jnp.zeros((4, 3))
     for _ in range(PASSES):

@@ -62,7 +62,9 @@ class Surface:
         around = self.height(xy[..., None, :] + ring.reshape((1,) * (xy.ndim - 1) + (8, 2)))
         centre = self.height(xy)
         # Least squares for points symmetric about the centre: sum(h * d) / sum(d^2) per axis.
-        gradient = around @ (ring / jnp.sum(ring[:, 0] ** 2))
+        # Written as a sum: a call of a matrix library costs more than the arithmetic.
+        weight = (ring / jnp.sum(ring[:, 0] ** 2)).reshape((1,) * (xy.ndim - 1) + (8, 2))
+        gradient = jnp.sum(around[..., None] * weight, axis=-2)
         return (jnp.sum(around, axis=-1) + centre) / 9.0, _normal(gradient)
 
     def _triangle(self, samples: Array, xy: Array) -> tuple[Array, Array, Array]:
