@@ -1,6 +1,9 @@
+import math
+
 import numpy as np
 import pytest
 
+from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.mission import Map, Mission, Robot, Target
 from moonteam.mission import Site as MissionSite
@@ -155,6 +158,7 @@ def bad_models(folder):
     (folder / "words.tif").write_text("not a picture")
     (folder / "words.npy").write_text("not an array")
     generate.write_dem(folder / "ok.tif", flat, 1.0)
+    generate.write_dem(folder / "nothing.tif", flat + np.nan, 1.0)
     return [
         ("missing.tif", {}, "no such file"),
         ("words.tif", {}, "not a GeoTIFF"),
@@ -170,16 +174,33 @@ def bad_models(folder):
         ("flat.npy", {}, "metres a pixel"),
         ("tiny.npy", {"pixel_m": 1.0}, "too small"),
         ("flat.npy", {"pixel_m": 10.0, "extent_m": 5.0}, "too coarse"),
+        ("flat.npy", {"pixel_m": math.nan}, "0.01 to 1000"),
+        ("flat.npy", {"pixel_m": 1.0, "extent_m": math.nan}, "not allowed"),
+        ("flat.npy", {"pixel_m": 1.0, "extent_m": 10.0, "centre_m": (math.nan, 0.0)},
+         "finite"),
+        ("flat.npy", {"pixel_m": 1.0, "scale": math.inf}, "finite"),
+        ("nothing.tif", {}, "no data"),
     ]
 
 
-@pytest.mark.parametrize("index", range(14))
-def test_bad_elevation_models_get_one_line(tmp_path, index):
+OPTIONS = {"pixel_m": "--pixel", "extent_m": "--size", "centre_m": "--centre",
+           "band": "--band", "scale": "--scale"}
+
+
+@pytest.mark.parametrize("index", range(19))
+def test_bad_elevation_models_get_one_line_and_exit_code_2(tmp_path, capsys, index):
     name, arguments, words = bad_models(tmp_path)[index]
     with pytest.raises(InputError, match=words) as caught:
         import_dem(tmp_path / name, **arguments)
     assert "\n" not in str(caught.value)
     assert name in str(caught.value)
+    asked = [word for key, value in arguments.items() for word in (
+        OPTIONS[key], *map(str, value if isinstance(value, tuple) else (value,)))]
+    assert main(["site", "--dem", str(tmp_path / name), *asked]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert words in told.err
 
 
 def test_measure_reports_what_the_ground_is():

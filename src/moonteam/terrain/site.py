@@ -174,6 +174,9 @@ def import_dem(
 
     Raises InputError: not readable, no data, a scale that cannot be ground, a window outside.
     """
+    for name, value in (("scale", scale), ("centre", centre_m[0]), ("centre", centre_m[1])):
+        if not math.isfinite(value):
+            raise InputError(path, f"{value} is not allowed; a finite number is needed", name)
     heights, pixel = _read(path, band, pixel_m)
     window = _window(path, heights * scale, pixel, extent_m, centre_m)
     window = _fill_holes(path, window)
@@ -280,6 +283,8 @@ def _window(path: str | os.PathLike[str], heights: np.ndarray, pixel: float,
     if extent_m is None:
         return heights.copy()
     sides = extent_m if isinstance(extent_m, tuple) else (extent_m, extent_m)
+    if not all(math.isfinite(side) and side > 0 for side in sides):
+        raise InputError(path, f"{sides[0]:g} by {sides[1]:g} m is not allowed", "size")
     slices = []
     for name, count, side, at in zip(("wide", "high"), (columns, rows), sides, centre_m,
                                      strict=True):
