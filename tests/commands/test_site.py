@@ -19,6 +19,14 @@ def test_a_site_is_made_measured_and_drawn(tmp_path, capsys):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     heights = np.load(out / "heights.npy")
     assert heights.shape == (57, 57)
+    maps = np.load(out / "maps.npz")
+    for kind, share in report["traversable"].items():
+        able, seconds = maps[f"open_{kind}"], maps[f"seconds_{kind}"]
+        assert able.shape == seconds.shape == (12, 12)
+        assert able.mean() == pytest.approx(share, abs=1e-4)
+        np.testing.assert_array_equal(np.isfinite(seconds), able)
+        assert seconds[able].max() == pytest.approx(report["seconds_per_cell"][kind]["most"],
+                                                    abs=1e-3)
 
     assert main(["site", "--dem", str(out / "heights.tif"), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
 from moonteam.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from moonteam.terrain.site import Site
+
+    Maps = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -15,7 +22,8 @@ class Args:
     """Make a site from a preset, or import an elevation model, and preview it.
 
     Writes heights.npy and heights.tif, site.json (measured slopes, roughness, crater counts
-    against the law), and pictures: hillshade, slope, roughness, traversability by kind.
+    against the law), maps.npz (by kind the cells that are open and the seconds to cross each),
+    and pictures: hillshade, slope, roughness, traversability by kind.
 
     Examples:
       moonteam site --preset mare --seed 3 --size 32 --out runs/site
@@ -75,9 +83,10 @@ def run(args: Args) -> int:
     from moonteam.terrain.measure import measure
 
     site = _site(args)
-    report = measure(site) | {"traversable": _open_shares(site, args.cell)}
+    seconds = _seconds(site, args.cell)
+    report = measure(site) | _summary(seconds)
     if args.out is not None:
-        report["files"] = _write(site, args.out, args.cell)
+        report["files"] = _write(site, args.out, args.cell, seconds)
         files.write_json(args.out / "site.json", report)
     if args.json:
         print(files.dump_json(report))
@@ -86,7 +95,7 @@ def run(args: Args) -> int:
     return 0
 
 
-def _site(args: Args) -> Any:
+def _site(args: Args) -> Site:
     from moonteam.terrain.site import import_dem, make_site
 
     if args.dem is None:
@@ -96,30 +105,46 @@ def _site(args: Args) -> Any:
                       detail=args.detail, spacing=args.spacing, seed=args.seed)
 
 
-def _open_shares(site: Any, cell_m: float) -> dict[str, float]:
-    """Share of the cells that each kind can cross."""
+def _seconds(site: Site, cell_m: float) -> Maps:
+    """kind -> [H, W] s to cross each cell, infinite where the kind cannot be."""
     from moonteam.terrain.preview import KINDS, grid_of
-    from moonteam.terrain.traversability import traversability
+    from moonteam.terrain.traversability import travel_times
 
-    maps = traversability(site, grid_of(site, cell_m), cell_m, KINDS)
-    return {kind: round(float(cells.mean()), 4) for kind, cells in maps.items()}
+    return travel_times(site, grid_of(site, cell_m), cell_m, KINDS)
 
 
-def _write(site: Any, out: Path, cell_m: float) -> list[str]:
-    """Writes elevations and pictures; the names of all files, site.json included."""
+def _summary(seconds: Maps) -> dict[str, Any]:
+    """By kind, the share of cells that it can cross and how long these take it."""
+    import numpy as np
+
+    shares, times = {}, {}
+    for kind, cells in seconds.items():
+        able = cells[np.isfinite(cells)]
+        shares[kind] = round(able.size / cells.size, 4)
+        times[kind] = {"median": round(float(np.median(able)), 3),
+                       "most": round(float(able.max()), 3)} if able.size else None
+    return {"traversable": shares, "seconds_per_cell": times}
+
+
+def _write(site: Site, out: Path, cell_m: float, seconds: Maps) -> list[str]:
+    """Writes elevations, maps and pictures; the names of all files, site.json included."""
     import numpy as np
 
     from moonteam.terrain.generate import write_dem
     from moonteam.terrain.preview import draw_all
 
+    arrays = {f"open_{kind}": np.isfinite(cells) for kind, cells in seconds.items()}
+    arrays |= {f"seconds_{kind}": cells.astype(np.float32) for kind, cells in seconds.items()}
+    with files.replacing(out / "maps.npz") as temporary:
+        np.savez_compressed(temporary, **arrays)
     with files.replacing(out / "heights.npy") as temporary:
         # North first, so that the file can be imported again.
         np.save(temporary, site.heights[::-1])
     with files.replacing(out / "heights.tif") as temporary:
         write_dem(temporary, site.heights, site.spacing)
-    pictures = draw_all(site, out, cell_m)
-    names = [out / "heights.npy", out / "heights.tif", out / "site.json", *pictures]
-    return [str(name) for name in names]
+    pictures = draw_all(site, out, cell_m, seconds)
+    names = ("heights.npy", "heights.tif", "site.json", "maps.npz")
+    return [str(name) for name in (*(out / name for name in names), *pictures)]
 
 
 def _show(report: dict[str, Any]) -> None:
@@ -136,7 +161,10 @@ def _show(report: dict[str, Any]) -> None:
         low, high = row["poisson_95"]
         print(f"  craters {row['from_m']:g} {to}: {row['counted']} "
               f"(law: {row['expected']:.1f}, 95 % of draws {low} to {high})")
-    print("  open cells: " + ", ".join(
-        f"{kind} {100 * share:.1f} %" for kind, share in report["traversable"].items()))
+    for kind, share in report["traversable"].items():
+        times = report["seconds_per_cell"][kind]
+        print(f"  {kind}: {100 * share:.1f} % of cells open" + (
+            f", {times['median']:.2f} s to cross one (at most {times['most']:.2f})"
+            if times else ""))
     for name in report.get("files", []):
         print(f"  {name}")

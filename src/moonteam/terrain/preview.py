@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from moonteam import files
-from moonteam.terrain import traversability
 from moonteam.terrain.measure import roughness_map, slope_map
 from moonteam.terrain.site import Site
+from moonteam.terrain.traversability import FloatMap
 
 EDGE = 1.0
 """Ground kept free around the grid, m: no robot can stand on the very edge."""
@@ -18,8 +18,11 @@ EDGE = 1.0
 KINDS = ("drone", "legged", "wheeled")
 
 
-def draw_all(site: Site, folder: Path, cell_m: float) -> list[Path]:
-    """Writes hillshade.png, slope.png, roughness.png and traversability.png; their paths."""
+def draw_all(site: Site, folder: Path, cell_m: float, times: dict[str, FloatMap]) -> list[Path]:
+    """Writes hillshade.png, slope.png, roughness.png and traversability.png; their paths.
+
+    `times`: kind -> [H, W] s to cross each cell of the grid about the site's centre.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -30,7 +33,7 @@ def draw_all(site: Site, folder: Path, cell_m: float) -> list[Path]:
         _draw(site, folder / "slope.png", "slope, degrees", slope, "inferno", limits=(0, 30)),
         _draw(site, folder / "roughness.png", "roughness over 1 m: rms about the plane, m",
               roughness_map(site), "viridis"),
-        _draw_traversability(site, folder / "traversability.png", cell_m),
+        _draw_traversability(site, folder / "traversability.png", cell_m, times),
     ]
 
 
@@ -72,17 +75,16 @@ def _draw(site: Site, path: Path, title: str, values: np.ndarray, colors: str, *
     return path
 
 
-def _draw_traversability(site: Site, path: Path, cell_m: float) -> Path:
+def _draw_traversability(site: Site, path: Path, cell_m: float, times: dict[str, FloatMap]
+                         ) -> Path:
     from matplotlib.figure import Figure
 
-    size = grid_of(site, cell_m)
-    times = traversability.travel_times(site, size, cell_m, KINDS)
-    half = (size[0] * cell_m / 2, size[1] * cell_m / 2)
     figure = Figure(figsize=(12.6, 4.6), layout="constrained")
-    for axes, kind in zip(figure.subplots(1, len(KINDS)), KINDS, strict=True):
+    for axes, kind in zip(figure.subplots(1, len(times)), times, strict=True):
         axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower",
                     extent=_box(site))
         seconds = times[kind]
+        half = [n * cell_m / 2 for n in seconds.shape[::-1]]
         open_share = np.isfinite(seconds).mean()
         color = axes.imshow(np.ma.masked_invalid(seconds), cmap="viridis_r", alpha=0.45,
                             origin="lower", extent=(-half[0], half[0], -half[1], half[1]))
