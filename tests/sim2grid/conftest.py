@@ -29,6 +29,7 @@ class SlidingPoints:
 
     start: np.ndarray  # [R, 2] m
     faults: dict = field(default_factory=dict)
+    traps: list = field(default_factory=list)  # (centre m, radius m) that nobody gets through
 
     def pose(self) -> np.ndarray:
         qpos = np.zeros((len(self.start), 7))
@@ -76,7 +77,9 @@ class SlidingPoints:
         away = goal - pose[:2]
         step = speed * CONTROL_PERIOD * {"slow": 0.02, "leisurely": 0.3}.get(what, 1.0)
         distance = np.hypot(*away)
-        pose[:2] += away if distance <= step else away / distance * step
+        there = pose[:2] + (away if distance <= step else away / distance * step)
+        if not any(np.hypot(*(there - centre)) < radius for centre, radius in self.traps):
+            pose[:2] = there
 
 
 class Script:
@@ -110,13 +113,14 @@ def make_mission(robots, targets, size=(4, 4), cell_m=1.0, **more) -> missions.M
     return missions.check(msgspec.convert(value | more, missions.Mission), "test")
 
 
-def run_on_points(spec, planner, *, faults=None, passable=None, speed=0.5, **options) -> Execution:
+def run_on_points(spec, planner, *, faults=None, passable=None, speed=0.5, traps=(),
+                  **options) -> Execution:
     """Runs a mission on sliding points to its end."""
     height, width = spec.map.size[1], spec.map.size[0]
     free = {r.kind: np.ones((height, width), bool) for r in spec.robots} | (passable or {})
     frame = Frame(spec.map.size, spec.map.cell_m)
     backend = SlidingPoints(frame.centre(np.array([r.start for r in spec.robots], float)),
-                            faults or {})
+                            faults or {}, list(traps))
     bodies = [Body(base=7 * i, speed=speed, flies=r.kind == "drone")
               for i, r in enumerate(spec.robots)]
     execution = Execution(spec, grid_problem(spec, free), planner, bodies, frame, **options)

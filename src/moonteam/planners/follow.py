@@ -17,7 +17,8 @@ from moonteam.planners.travel import travel_times
 
 def same_moment(one: Snapshot, other: Snapshot) -> bool:
     """Whether two snapshots pose the same problem (the step count aside)."""
-    fields = ("cells", "solved", "target_cells", "target_skills", "target_and", "agent_mask")
+    fields = ("cells", "solved", "target_cells", "target_skills", "target_and", "agent_mask",
+              "passable")
     return all(np.array_equal(getattr(one, f), getattr(other, f)) for f in fields)
 
 
