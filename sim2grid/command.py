@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 import numpy.typing as npt
@@ -45,10 +45,11 @@ class Args:
       moonteam rollout outpost --planner exact --backend native --out runs/outpost
       moonteam rollout my_mission.yaml --planner exact --no-video --json
       moonteam rollout demo --planner exact --backend native --viewer
+      moonteam rollout --from runs/execution/report.json --mission 17
     """
 
-    mission: tyro.conf.Positional[str]
-    """Mission file (.yaml) or the name of a bundled mission."""
+    mission: tyro.conf.Positional[str] = ""
+    """Mission file (.yaml) or the name of a bundled mission; not with --from."""
     planner: Literal["policy", "exact", "greedy"] = "policy"
     """Who decides: a learned policy, the exact planner, or greedy insertion."""
     policy: str = "small"
@@ -63,6 +64,13 @@ class Args:
     """Physics engine: MJX (JAX) or C MuJoCo, which is faster on a CPU."""
     seed: int = 0
     """Seed of what is random in the planner; the ground has its own seed in the mission."""
+    report: Annotated[Path | None, tyro.conf.arg(name="from", metavar="REPORT")] = None
+    """Instead of a mission file: report.json of `moonteam evaluate execution`. The mission is run
+    again as it was then, planner and seed included, and ends as it did on the same machine."""
+    number: Annotated[int | None, tyro.conf.arg(name="mission", metavar="N")] = None
+    """Number of the mission in --from."""
+    contender: str | None = None
+    """Whose run of it, a name in --from such as "closed exact barrier"; the first by default."""
     out: Path | None = None
     """Output folder; runs/NAME by default."""
     video: bool = True
@@ -71,6 +79,10 @@ class Args:
     """Show the mission in a live 3-D window while it runs; needs a display."""
     json: bool = False
     """Print the report as one JSON document and nothing else."""
+
+
+FROM_REPORT = ("planner", "policy", "decode", "objective", "mode", "backend", "seed")
+"""Options that a report answers for its missions."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +101,7 @@ class Run:
     command: str  # that makes it again
     width: int = 1  # rows of the engine
     row: int = 0  # the one that is used
+    before: Report | None = None  # what came of it when it was run first
 
 
 def run(args: Args) -> int:
@@ -101,7 +114,7 @@ def run(args: Args) -> int:
         from sim2grid.viewer import check_display
 
         check_display()
-    made = _from_file(args)
+    made = _from_file(args) if args.report is None else _from_report(args)
     mission = made.prepared.mission
     out = args.out or Path("runs") / mission.name
     _make_folder(out, args, mission)
@@ -125,6 +138,9 @@ def run(args: Args) -> int:
         print(files.dump_json(report))
     else:
         _show(report, timing, out, video)
+    if made.before is not None and report != made.before:
+        _say(f"not as in {args.report}: {_difference(made.before, report)}; another machine or "
+             "other versions?")
     return 0 if report.success else 1
 
 
@@ -137,6 +153,21 @@ def _check(args: Args) -> None:
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise InputError("--out", f"{args.out} is a file; a folder is needed")
     parse(args.decode)
+    if args.report is None:
+        for name, value in (("--mission", args.number), ("--contender", args.contender)):
+            if value is not None:
+                raise InputError(name, "says which mission of a report; give --from REPORT too")
+        if not args.mission:
+            raise InputError("rollout", "give a mission file, the name of a bundled "
+                             "mission, or --from REPORT --mission N")
+        return
+    if args.mission:
+        raise InputError("--from", f"give a report or the mission {args.mission}, not both")
+    if args.number is None:
+        raise InputError("--from", "give the number of the mission too: --mission N")
+    for field in fields(args):
+        if field.name in FROM_REPORT and getattr(args, field.name) != field.default:
+            raise InputError(f"--{field.name}", "not with --from: the report says it")
 
 
 def _from_file(args: Args) -> Run:
@@ -154,6 +185,22 @@ def _from_file(args: Args) -> Run:
     return Run(prepared, execution, prepared.scene.qpos0, plan, args.planner,
                None if args.planner == "policy" else args.objective, args.backend, args.seed,
                f"{mission.name}: {who}", _command(args))
+
+
+def _from_report(args: Args) -> Run:
+    """The run of a mission of an evaluation. Raises InputError for one that is not there."""
+    from sim2grid.restage import load_report, restage
+
+    assert args.report is not None
+    assert args.number is not None
+    staged = restage(load_report(args.report), args.number, args.report, args.contender)
+    row, contender = staged.row, staged.contender
+    words = ["moonteam", "rollout", "--from", str(args.report), "--mission", str(row.number),
+             "--contender", contender.name]
+    return Run(staged.prepared, staged.execution, staged.prepared.scene.qpos0, staged.grid_plan,
+               row.report.planner, row.report.objective, staged.backend, row.seed,
+               f"mission {row.number}, {row.site}: {contender.name}", shlex.join(words),
+               staged.width, row.slot, row.report)
 
 
 def _command(args: Args) -> str:
@@ -331,6 +378,16 @@ def _bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
 
 def _say(text: str) -> None:
     print(f"moonteam: {text}", file=sys.stderr, flush=True)
+
+
+def _difference(before: Report, now: Report) -> str:
+    """The first figure in which two reports differ."""
+    for name in before.__struct_fields__:
+        if getattr(before, name) != getattr(now, name):
+            if isinstance(getattr(now, name), tuple):
+                return f"{name} differ"
+            return f"{name} was {getattr(before, name)}, is {getattr(now, name)}"
+    return "nothing"
 
 
 def _show(report: Report, timing: dict[str, float], out: Path, video: Path | None) -> None:

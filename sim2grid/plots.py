@@ -120,6 +120,8 @@ def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any], f
         axis.set_yticks(places, names if axis is axes[0] else [])
         axis.set_ylim(-0.6, len(names) - 0.2)
         axis.margins(x=0.15)
+        if title == "success":
+            axis.set_xlim(min(axis.get_xlim()[0], 0.9), 1.03)
     return _svg(figure)
 
 
@@ -136,8 +138,8 @@ def histograms(title: str, groups: dict[str, Sequence[float]]) -> str:
         axis.hist(values, bins=bins, color=hexed(robot_color(i)), alpha=0.85)
         axis.axvline(float(np.median(values)), color=hexed(INK), lw=1.2)
         axis.set_yticks([])
-        axis.annotate(f"{name}: median {np.median(values):.3g}", (1.0, 0.82), ha="right",
-                      xycoords="axes fraction", fontsize=8, color=hexed(INK))
+        axis.set_title(f"{name}: median {np.median(values):.3g}", loc="right", fontsize=8,
+                       color=hexed(INK), pad=2)
     axes[-1].set_xlabel(title)
     return _svg(figure)
 

@@ -59,6 +59,9 @@ def test_bad_missions_one_line_code_two_nothing_written(tmp_path, capsys, old, n
     (["--decode", "best-of-many"], "--decode"),
     (["--planner", "policy", "--policy", "nobody"], "nobody"),
     (["--planner", "policy"], "made for 3 robots"),
+    (["--mission", "3"], "give --from REPORT too"),
+    (["--contender", "x"], "give --from REPORT too"),
+    (["--from", "report.json"], "not both"),
 ])
 def test_bad_options_one_line_code_two_nothing_written(tmp_path, capsys, options, named):
     file, out = tmp_path / "good.yaml", tmp_path / "out"
@@ -126,7 +129,10 @@ def test_real_robots_solve_a_tiny_mission_and_the_same_seed_gives_the_same_repor
     assert report["robots"][0]["propellant_kg"] > 0
     one = tmp_path / "one"
     assert {p.name for p in one.iterdir()} == {
-        "report.json", "timing.json", "config.json", "paths.png"}
+        "report.json", "timing.json", "config.json", "paths.png", "report.html"}
+    page = (one / "report.html").read_text()
+    assert "tiny: " in page
+    assert "slip" in page
     assert json.loads((one / "report.json").read_text()) == report
 
     assert rollout(file, tmp_path / "two") == 0
@@ -174,3 +180,68 @@ def test_an_interrupted_rollout_saves_what_is_done(tmp_path, capsys, monkeypatch
     assert report["seconds"] == pytest.approx(0.4)
     assert (out / "paths.png").stat().st_size > 1000
     assert "report.json" in capsys.readouterr().err
+
+
+def test_new_targets_that_a_planner_cannot_take_are_refused_before_the_start(tmp_path, capsys):
+    events = "events:\n" + "".join(
+        f"  - {{at_decision: {k + 1}, target: {{at: [2, 2], skills: [A]}}}}\n" for k in range(12))
+    file, out = tmp_path / "many.yaml", tmp_path / "out"
+    file.write_text(GOOD + events)
+    assert rollout(file, out) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "13 targets, those of events counted" in message
+    assert not out.exists()
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """The report of two small missions, in one of which a robot is lost."""
+    out = tmp_path_factory.mktemp("evaluated")
+    assert main(["evaluate", "execution", "--site", "flat", "--side", "4", "--targets", "1",
+                 "--count", "2", "--planner", "exact", "--mode", "async", "--loop", "closed",
+                 "open", "--lose", "0.5", "--out", str(out), "--json"]) == 0
+    return out / "report.json"
+
+
+def test_any_mission_of_an_evaluation_is_made_again_to_the_bit(evaluated, tmp_path, capsys):
+    document = json.loads(evaluated.read_text())
+    for row in document["rows"]:
+        if row["number"] == 0:
+            continue
+        out = tmp_path / row["contender"]
+        code = main(["rollout", "--from", str(evaluated), "--mission", str(row["number"]),
+                     "--contender", row["contender"], "--no-video", "--out", str(out)])
+        assert code == (0 if row["report"]["success"] else 1)
+        report = json.loads((out / "report.json").read_text())
+        for key in ("success", "decisions", "seconds", "cause"):
+            assert report[key] == row["report"][key], key
+        assert report == row["report"]
+        assert "not as in" not in capsys.readouterr().err
+        assert f"--contender {row['contender']!r}" in (out / "report.html").read_text().replace(
+            "&#x27;", "'")
+
+
+@pytest.mark.parametrize(("options", "named"), [
+    (["--mission", "7"], "holds no mission 7"),
+    (["--mission", "1", "--contender", "nobody"], "has no contender 'nobody'"),
+    (["--mission", "1", "--seed", "3"], "--seed: not with --from"),
+    ([], "--mission N"),
+])
+def test_missions_that_a_report_does_not_hold_are_refused(
+        evaluated, tmp_path, capsys, options, named):
+    out = tmp_path / "out"
+    assert main(["rollout", "--from", str(evaluated), "--out", str(out), *options]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert named in message
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(("text", "named"), [
+    ("{", "not JSON"), ("[]", "is no report.json"), ('{"kind": "grid"}', "is no report.json")])
+def test_what_is_no_report_is_refused(tmp_path, capsys, text, named):
+    file = tmp_path / "report.json"
+    file.write_text(text)
+    assert main(["rollout", "--from", str(file), "--mission", "0"]) == 2
+    assert named in capsys.readouterr().err
