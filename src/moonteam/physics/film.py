@@ -29,10 +29,10 @@ from moonteam.terrain.site import Site
 EVENTS = ("rim", "boulders", "slope")
 STATION = 0.25  # m between the points that a route is judged on
 STRETCH = 2.0  # m over which a slope is taken
-CLIP_SECONDS = 12.0  # of a film
+CLIP_SECONDS = {"drone": 16.0, "legged": 12.0, "wheeled": 12.0}  # a drone's: take-off to goal
 SHADOW_REACH = 7.0  # m around the robot
 DISTANCE = {"drone": 4.2, "legged": 2.6, "wheeled": 2.9}  # m, camera from the robot
-RIM_DISTANCE = 2.2  # times as far, so that the rim is seen as one
+RIM_DISTANCE = 1.7  # times as far, so that the rim is seen as one
 LOWEST, HIGHEST = 14.0, 75.0  # degrees, camera above the horizon
 VIEWS = (-125.0, -55.0, 55.0, 125.0)  # degrees, from the heading to where the camera looks
 CLEAR = 0.25  # m, kept between the line of sight and the ground or a boulder
@@ -144,8 +144,8 @@ def contact_sheet(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], path: Path,
 
 def _clip(recording: Recording, along: float | None) -> tuple[int, int]:
     """First and past-the-last pose of a film."""
-    _, route, poses = recording
-    count = round(CLIP_SECONDS / SAMPLE_SECONDS)
+    scene, route, poses = recording
+    count = round(CLIP_SECONDS[scene.robots[0].kind.name] / SAMPLE_SECONDS)
     if along is None or len(poses) <= count:
         return 0, min(count, len(poses))
     way = np.array(route.goal) - route.start
