@@ -31,8 +31,8 @@ class Args:
     robots in lockstep), oracle (closed with the exact planner) and grid (no physics).
     Exit code 0 whatever the missions came to, 130 if interrupted, with what is done saved.
 
-    Files in --out: report.json, rows.csv, table.md, and rows.jsonl, to which each mission is
-    added as it ends, so that --resume can go on. The same options give the same report.
+    Files in --out: report.html (one page), report.json, rows.csv, table.md, and rows.jsonl, to which
+    each mission is added as it ends, so that --resume can go on. The same options give the same report.
 
     Examples:
       moonteam evaluate execution --site mare highland --count 100 --out runs/execution
@@ -247,9 +247,11 @@ def _read(path: Path) -> list[Row]:
 
 def _save(out: Path, report: dict[str, Any], rows: list[Row]) -> None:
     from moonteam.evaluation.report import plain_csv, plain_markdown
+    from sim2grid.evaluation_page import evaluation_page
     from sim2grid.summary import csv_rows, tables
 
     files.write_json(out / "report.json", report)
+    files.write_text(out / "report.html", evaluation_page(report, str(out / "report.json")))
     files.write_text(out / "table.md", plain_markdown(report, tables(report)) + "\n")
     if rows:
         files.write_text(out / "rows.csv", plain_csv(csv_rows(rows)))
