@@ -31,8 +31,9 @@ class Args:
     robots in lockstep), oracle (closed with the exact planner) and grid (no physics).
     Exit code 0 whatever the missions came to, 130 if interrupted, with what is done saved.
 
-    Files in --out: report.html (one page), report.json, rows.csv, table.md, and rows.jsonl, to which
-    each mission is added as it ends, so that --resume can go on. The same options give the same report.
+    Files in --out: report.html (one page), report.json, rows.csv, table.md, and rows.jsonl, to
+    which each mission is added as it ends, so that --resume can go on. The same options give the
+    same report.
 
     Examples:
       moonteam evaluate execution --site mare highland --count 100 --out runs/execution
