@@ -58,13 +58,17 @@ PRESETS = {
     "any_team": Imitation(
         families=(
             *PAPER,
-            Family(2, 4, sides=(8, 32)),
-            Family(4, 8, num_skills=3, sides=(16, 64), max_steps=256),
-            Family(6, 9, num_skills=3, sides=(16, 40)),
+            Family(2, 6, sides=(8, 32)),
+            Family(3, 9, sides=(16, 48)),
+            Family(4, 7, num_skills=3, sides=(16, 64), max_steps=256),
+            Family(5, 9, num_skills=3, sides=(16, 40)),
+            Family(6, 11, sides=(16, 40), exact_to=9, iterations=100),
             Family(3, 6, grounds=1024),
-            Family(5, 8, num_skills=3, grounds=512),
+            Family(4, 7, num_skills=3, grounds=512),
+            Family(5, 18, exact_to=7, iterations=100, shrink=4),
+            Family(7, 30, num_skills=3, exact_to=7, iterations=100, shrink=8),
         ),
-        rounds=1500, batches=2),
+        rounds=1300, batches=2),
 }
 """Presets of `moonteam train` that imitate the exact planner."""
 
@@ -144,8 +148,8 @@ class _Play(NamedTuple):
     moves: Array
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def play(spec: EntitySpec, family: Family, preference: float, params: Any,
+@partial(jax.jit, static_argnums=(0, 1))
+def play(spec: EntitySpec, family: Family, preference: Array | np.float32, params: Any,
          ground: Ground | None, walk: Walk) -> tuple[Array, Array, Array]:
     """Argmax to the end: solved [E], steps [E], moves [E]."""
     wish = jnp.full_like(walk.preference, preference)
@@ -173,7 +177,7 @@ class HeldOut:
     """Scenarios of one family that training never draws, with their optima."""
 
     def __init__(self, family: Family, count: int):
-        """Solves each once for makespan and once for moves."""
+        """Solves each once for makespan and once for moves (large ones nearly)."""
         self.family = family
         self.ground = make_ground(dataclasses.replace(family, grounds=min(family.grounds, count)),
                                   HELD_OUT_SEED)
@@ -187,7 +191,8 @@ class HeldOut:
             return solve_batch(
                 states.cells, problem.agent_skills, problem.target_cells, problem.target_skills,
                 problem.target_and, solved=states.solved, agent_mask=problem.agent_mask,
-                steps_left=1024, objective=objective, **given)
+                steps_left=1024, objective=objective, exact_to=self.family.exact_to,
+                iterations=10 * self.family.iterations, **given)
 
         self.best_makespan = float(optimum("makespan").makespan.mean())
         self.best_moves = float(optimum("moves").moves.mean())
@@ -195,7 +200,7 @@ class HeldOut:
     def score(self, spec: EntitySpec, params: Any, preference: float) -> Score:
         """How the policy does by argmax, without a deadlock watch."""
         solved, steps, moves = jax.device_get(
-            play(spec, self.family, preference, params, self.ground, self.walk))
+            play(spec, self.family, np.float32(preference), params, self.ground, self.walk))
         return Score(float(solved.mean()), float(steps.mean()), float(moves.mean()),
                      self.best_makespan, self.best_moves)
 
@@ -222,7 +227,7 @@ class Run:
         self.dagger = Dagger(config)
         if resume and self.state_file.exists():
             self._load()
-        self.held_out = [HeldOut(f, SCENARIOS) for f in config.families]
+        self.held_out = [HeldOut(f, SCENARIOS // f.shrink) for f in config.families]
 
     def train(self, stop: Stop) -> bool:
         """Runs to the end or until asked to stop; True when it reached the end."""

@@ -43,7 +43,7 @@ class Family:
     num_agents: int
     """N."""
     num_targets: int
-    """M, at most 12: the oracle's limit."""
+    """M; up to `exact_to` open ones the planner's plans are optimal, beyond they are good."""
     num_skills: int = 2
     """Skills that exist."""
     sides: tuple[int, int] = (32, 32)
@@ -52,6 +52,12 @@ class Family:
     """Horizon of an episode."""
     grounds: int = 0
     """P, maps with blocked cells that are drawn from; 0: open maps."""
+    exact_to: int = MAX_TARGETS
+    """Open targets up to which the planner is exact."""
+    iterations: int = 0
+    """Of its large-neighbourhood search beyond them."""
+    shrink: int = 1
+    """Environments and batches are this many times smaller: large problems cost more."""
 
     @property
     def config(self) -> EnvConfig:
@@ -90,9 +96,10 @@ class Imitation:
 
     def __post_init__(self) -> None:
         for i, family in enumerate(self.families):
-            if not 1 <= family.num_targets <= MAX_TARGETS:
-                raise InputError("imitation", f"{family.num_targets} targets; the oracle takes 1 "
-                                 f"to {MAX_TARGETS}", f"families[{i}].num_targets")
+            most = family.exact_to if not family.iterations else 60
+            if not 1 <= family.num_targets <= most:
+                raise InputError("imitation", f"{family.num_targets} targets; the planner takes 1 "
+                                 f"to {most}", f"families[{i}].num_targets")
         if self.capacity % self.num_envs:
             raise InputError("imitation", f"{self.num_envs} environments do not divide "
                              f"{self.capacity}", "capacity")
@@ -244,9 +251,9 @@ def walk_on(spec: EntitySpec, family: Family, steps: int, params: Any, ground: G
     return jax.lax.scan(step, walk, None, steps)[0]
 
 
-def solve(ground: Ground | None, states: State, place: np.ndarray, preference: np.ndarray,
-          threads: int | None = None) -> BatchPlans:
-    """Exact plans of states [B] (host arrays) at their preference between time and effort."""
+def solve(family: Family, ground: Ground | None, states: State, place: np.ndarray,
+          preference: np.ndarray, threads: int | None = None) -> BatchPlans:
+    """Exact or good plans of states [B], host arrays, at their preference."""
     problem = states.problem
     passable = None if ground is None else np.asarray(ground.passable)[place]
     return solve_batch(
@@ -254,13 +261,14 @@ def solve(ground: Ground | None, states: State, place: np.ndarray, preference: n
         problem.target_and, solved=states.solved, agent_mask=problem.agent_mask, steps_left=1024,
         agent_kinds=problem.agent_kinds if ground is not None else None, passable=passable,
         objective="weighted", alpha=1.0 - preference + TIE_BREAK, beta=preference + TIE_BREAK,
-        threads=threads)
+        threads=threads, exact_to=family.exact_to, iterations=family.iterations)
 
 
-def label(ground: Ground | None, walk: Walk, threads: int | None = None) -> Sample:
-    """The walk's states with the oracle's next target for each agent."""
+def label(family: Family, ground: Ground | None, walk: Walk,
+          threads: int | None = None) -> Sample:
+    """The walk's states with the planner's next target for each agent."""
     states, place, wish = jax.device_get((walk.states, walk.place, walk.preference))
-    plans = solve(ground, states, place, wish, threads)
+    plans = solve(family, ground, states, place, wish, threads)
     num_targets = states.problem.target_skills.shape[1]
     pointer = np.where(plans.next_target < 0, num_targets, plans.next_target).astype(np.int32)
     return Sample(states, place, wish, pointer)
@@ -355,9 +363,9 @@ class Dagger:
         self.learner = everywhere(Learner(params, mean, optimiser(config).init(params)))
         self.grounds = [everywhere(make_ground(f, config.seed + i))
                         for i, f in enumerate(config.families)]
-        self.walks = [spread_walk(begin(f, g, k, config.num_envs)) for f, g, k in
+        self.walks = [spread_walk(begin(f, g, k, config.num_envs // f.shrink)) for f, g, k in
                       zip(config.families, self.grounds, keys[1:], strict=True)]
-        self.memories = [Memory(config.capacity) for _ in config.families]
+        self.memories = [Memory(config.capacity // f.shrink) for f in config.families]
 
     @property
     def done(self) -> bool:
@@ -372,10 +380,10 @@ class Dagger:
             ground = self.grounds[i]
             self.walks[i] = walk_on(config.spec, family, config.steps_between,
                                     self.learner.params, ground, self.walks[i])
-            self.memories[i].add(label(ground, self.walks[i]))
+            self.memories[i].add(label(family, ground, self.walks[i]))
             rng = np.random.default_rng([config.seed, self.number, i])
             for _ in range(config.batches):
-                batch = spread(self.memories[i].draw(rng, config.batch_size))
+                batch = spread(self.memories[i].draw(rng, config.batch_size // family.shrink))
                 self.learner, value = learn(config, family, ground, self.learner, batch)
                 losses.append(value)
         self.number += 1

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from moonteam.errors import InputError
-from moonteam.planners import search
+from moonteam.planners import insertion, search
 from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.exact import MAX_TARGETS
 from moonteam.planners.task import weights
@@ -139,8 +139,53 @@ def _drop_hopeless(start, skills, target_skills, target_and, index, count):
 
 
 @njit(cache=True, nogil=True)
+def _inserted(start, between, kinds, masks, first, alpha, beta, horizon, regret, order, team):
+    """Fills order [M] and team [M] by insertion; returns what the plan costs."""
+    n, m = start.shape
+    head, tail = np.zeros(m, np.int32), np.zeros(m, np.int32)
+    following = np.zeros((m + 1, n), np.int32)
+    _, makespan, moves = insertion.insert_all(
+        np.arange(m).astype(np.int32), regret, start, between, kinds, order, team, 0, head, tail,
+        following, masks, first, alpha, beta, horizon, 0.0)
+    return insertion.price(makespan, moves, alpha, beta, horizon)
+
+
+@njit(cache=True, nogil=True)
+def _search_near(start, between, kinds, skills, need, both, alpha, beta, horizon, iterations, seed,
+                 found):
+    """Insertion, then a large-neighbourhood search; fills routes `found` [N, M] and returns
+    (makespan, moves).
+    """
+    n, m = start.shape
+    masks, first = insertion.coalitions(start, skills, need, both)
+    order, team = np.zeros(m, np.int32), np.zeros(m, np.int32)
+    cost = _inserted(start, between, kinds, masks, first, alpha, beta, horizon, True, order, team)
+    other, others = np.zeros(m, np.int32), np.zeros(m, np.int32)
+    if _inserted(start, between, kinds, masks, first, alpha, beta, horizon, False, other,
+                 others) < cost:
+        order[:], team[:] = other, others
+    best_order, best_team = order.copy(), team.copy()
+    warm = max(alpha, beta)
+    for part in range(4):  # cooler and cooler
+        insertion.improve(
+            start, between, kinds, masks, first, order, team, alpha, beta, alpha, beta, horizon,
+            iterations // 4, warm * 2.0 * 0.4**part, warm * 2.0 * 0.4**(part + 1), seed + part,
+            best_order, best_team)
+    for a in range(n):
+        count = 0
+        for i in range(m):
+            if best_team[i] >> a & 1:
+                found[a, count] = best_order[i]
+                count += 1
+    head, tail = np.zeros(m, np.int32), np.zeros(m, np.int32)
+    return insertion.measure(start, between, kinds, best_order, best_team, m, head, tail,
+                             np.zeros((m + 1, n), np.int32))
+
+
+@njit(cache=True, nogil=True)
 def _solve_one(cells, kinds, skills, target_cells, target_skills, target_and, solved, horizon,
-               passable, alpha, beta, limit, routes, next_target, arrival, meeting):
+               passable, alpha, beta, limit, exact_to, iterations, seed, routes, next_target,
+               arrival, meeting):
     """One state; returns (status, makespan, moves) and fills the four last arguments."""
     n, m = cells.shape[0], target_cells.shape[0]
     index = np.empty(m, np.int32)
@@ -162,10 +207,15 @@ def _solve_one(cells, kinds, skills, target_cells, target_skills, target_and, so
     both = target_and[index[:kept]]
     which = kinds if passable.shape[0] else np.zeros(n, np.int32)
     found = np.full((n, kept), -1, np.int32)
-    outcome, makespan, moves, bound = search.solve(
-        start, between, which, skills, need, both, alpha, beta, horizon, 0.0, np.inf, limit,
-        found)
-    status = OPTIMAL if outcome == search.OPTIMAL else FEASIBLE
+    if kept > exact_to:
+        makespan, moves = _search_near(start, between, which, skills, need, both, alpha, beta,
+                                       horizon, iterations, seed, found)
+        outcome, status, bound = search.FEASIBLE, FEASIBLE, 0.0
+    else:
+        outcome, makespan, moves, bound = search.solve(
+            start, between, which, skills, need, both, alpha, beta, horizon, 0.0, np.inf, limit,
+            found)
+        status = OPTIMAL if outcome == search.OPTIMAL else FEASIBLE
     if outcome == search.NONE:
         status = UNFINISHED
         if np.isinf(bound):
@@ -191,15 +241,15 @@ def _solve_one(cells, kinds, skills, target_cells, target_skills, target_and, so
 
 @njit(cache=True, nogil=True)
 def _solve_range(first, last, cells, kinds, skills, target_cells, target_skills, target_and,
-                 solved, horizon, passable, alpha, beta, limit, status, makespan, moves, routes,
-                 next_target, arrival, meeting):
+                 solved, horizon, passable, alpha, beta, limit, exact_to, iterations, status,
+                 makespan, moves, routes, next_target, arrival, meeting):
     """States first..last-1 of a batch; `passable` is [1 or B, K, H, W], K = 0 if open."""
     for b in range(first, last):
         ground = passable[b] if passable.shape[0] > 1 else passable[0]
         status[b], makespan[b], moves[b] = _solve_one(
             cells[b], kinds[b], skills[b], target_cells[b], target_skills[b], target_and[b],
-            solved[b], horizon[b], ground, alpha[b], beta[b], limit, routes[b], next_target[b],
-            arrival[b], meeting[b])
+            solved[b], horizon[b], ground, alpha[b], beta[b], limit, exact_to, iterations, b,
+            routes[b], next_target[b], arrival[b], meeting[b])
 
 
 def cores() -> int:
@@ -225,8 +275,10 @@ def solve_batch(
     beta: npt.ArrayLike = 0.05,
     node_limit: int = 20_000_000,
     threads: int | None = None,
+    exact_to: int = MAX_TARGETS,
+    iterations: int = 0,
 ) -> BatchPlans:
-    """Optimal plans of B states, each with at most 12 targets still open.
+    """Optimal plans of B states, each with at most 12 targets still open; good plans of larger.
 
     Args:
       cells: [B, N, 2] cells (x, y).
@@ -244,9 +296,12 @@ def solve_batch(
       beta: weight of the moves if weighted, one or [B].
       node_limit: search nodes a state may take; far above what is usual.
       threads: cores to use; None: all.
+      exact_to: open targets up to which plans are optimal, at most 12.
+      iterations: of large-neighbourhood search where more targets are open (FEASIBLE); 0:
+        no such state is allowed.
 
     Raises:
-      InputError: more than 12 open targets.
+      InputError: more than 12 open targets and no iterations.
     """
     places = np.ascontiguousarray(cells, np.int32)
     size, n = places.shape[:2]
@@ -256,7 +311,7 @@ def solve_batch(
     skills = np.where(mask, np.asarray(agent_skills, np.int32), 0).astype(np.int32)
     done = np.zeros((size, m), bool) if solved is None else np.ascontiguousarray(solved, bool)
     most = int((~done).sum(1).max(initial=0))
-    if most > MAX_TARGETS:
+    if most > min(exact_to, MAX_TARGETS) and not iterations:
         raise InputError("solve_batch", f"{most} targets are open; at most {MAX_TARGETS}")
     horizon = np.ascontiguousarray(np.broadcast_to(np.asarray(steps_left, np.int64), (size,)))
     kinds = np.zeros((size, n), np.int32) if agent_kinds is None else agent_kinds
@@ -272,6 +327,7 @@ def solve_batch(
         places, np.ascontiguousarray(kinds, np.int32), skills, goals,
         np.ascontiguousarray(target_skills, np.int32), np.ascontiguousarray(target_and, bool),
         done, horizon, ground, pairs[:, 0].copy(), pairs[:, 1].copy(), node_limit,
+        min(exact_to, MAX_TARGETS), iterations,
         out.status, out.makespan, out.moves, out.routes, out.next_target, out.arrival,
         out.meeting)
     workers = threads or cores()
