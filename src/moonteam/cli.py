@@ -29,6 +29,7 @@ COMMANDS = {
         "moonteam.commands.evaluate_traverse", "each kind of robot on its own over a site"),
     "evaluate slopes": (
         "moonteam.commands.evaluate_slopes", "how steep each kind of robot can go"),
+    "export": ("moonteam.commands.export", "a policy as an ONNX file that runs without JAX"),
     "site": ("moonteam.commands.site", "make, import and preview lunar terrain"),
     "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
     "bench train": ("training.bench", "training throughput"),

@@ -141,7 +141,7 @@ class Player:
 
 
 @partial(jax.jit, static_argnames="player")
-def _begin(player: Player, source: Source, scenario: Array, attempt: Array) -> Pool:
+def begin(player: Player, source: Source, scenario: Array, attempt: Array) -> Pool:
     """A pool of fresh episodes [E]."""
     return player.fresh(source, scenario, attempt)
 
@@ -157,7 +157,7 @@ def _refill(player: Player, source: Source, pool: Pool, taken: Array, scenario: 
 
 
 @partial(jax.jit, static_argnames="player")
-def _play(player: Player, params: Any, pool: Pool, seed: Array, heat: Array,
+def play(player: Player, params: Any, pool: Pool, seed: Array, heat: Array,
           preference: Array) -> Pool:
     """Some steps of the pool, fewer if all episodes end."""
     key = jax.random.key(seed)
@@ -216,6 +216,12 @@ def survey(world: World) -> tuple[Array | None, Array | None]:
     free = problem.passable & on_map[:, None]
     fields = np.stack([distance_fields(free[i], spots[i]) for i in range(len(free))])
     return jnp.asarray(spots), jnp.asarray(fields)
+
+
+def source_of(world: World, brain: Brain) -> Source:
+    """The scenarios with what the network must know of their ground."""
+    return Source(world.start, world.horizon,
+                  *(survey(world) if brain.travels else (None, None)))
 
 
 @dataclass
@@ -290,15 +296,14 @@ def run(policy: Policy, world: World, decode: Decode, preference: float, seed: i
     size = rollouts if alone else _places(world, count * rollouts)
     player = Player(world.config, policy.brain, decode.sample, decode.watch, world.longest)
     began = time.perf_counter()
-    source = Source(world.start, world.horizon,
-                    *(survey(world) if policy.brain.travels else (None, None)))
+    source = source_of(world, policy.brain)
     seconds = time.perf_counter() - began
     say(f"compiling {title}")
     began = time.perf_counter()
     blank = jnp.zeros(size, jnp.int32)
     given = (np.uint32(seed % 2**32), np.float32(decode.temperature), np.float32(preference))
-    pool = _begin(player, source, blank, blank - 1)
-    playing = _play.lower(player, policy.params, pool, *given).compile()
+    pool = begin(player, source, blank, blank - 1)
+    playing = play.lower(player, policy.params, pool, *given).compile()
     filling = _refill.lower(player, source, pool, blank > 0, blank, blank).compile()
     compiling = time.perf_counter() - began
 
@@ -311,8 +316,9 @@ def run(policy: Policy, world: World, decode: Decode, preference: float, seed: i
     ledger = _Ledger(np.asarray(world.horizon, np.int64), rollouts, prices)
     sets = np.arange(count * rollouts).reshape(-1, rollouts) if alone else [
         np.arange(count * rollouts)]
-    play = partial(_drain, ledger, pool, refill, lambda pool: playing(policy.params, pool, *given))
-    for _ in track((one for ids in sets for one in play(ids)), title, count * rollouts):
+    drain = partial(_drain, ledger, pool, refill,
+                    lambda pool: playing(policy.params, pool, *given))
+    for _ in track((one for ids in sets for one in drain(ids)), title, count * rollouts):
         pass
     return ledger.tries(seconds + time.perf_counter() - began, compiling)
 
