@@ -49,8 +49,9 @@ SPEEDS = (0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40,
 MARGIN = 10
 SIDE = 190  # of the map beside 3-D pictures
 CLOSE = (168, 112)  # largest size of a robot's close view
+AT_REST = 0.12  # m/s
 NEWS_S = 1.6  # film seconds for which the cause of a new plan is told
-FREE = (MARGIN, MARGIN, WIDTH - SIDE - 3 * MARGIN, HEIGHT - CLOSE[1] - 2 * MARGIN)
+FREE = (MARGIN, 6 * MARGIN, WIDTH - SIDE - 3 * MARGIN, HEIGHT - CLOSE[1] - 2 * MARGIN)
 """Left, top, right, bottom of what no map, list or close view covers."""
 
 
@@ -142,9 +143,13 @@ class Film:
         decision = sum(d.time_s <= time_s + 1e-9 for d in record.decisions)
         robots = range(len(self.paths))
         status, goals = zip(*(story.state(i, time_s) for i in robots), strict=True)
+        speeds = tuple(story.speed(i, time_s) for i in robots)
+        # A robot that has arrived may still be coming to rest.
+        status = tuple("moving" if word == "waiting" and speed > AT_REST else word
+                       for word, speed in zip(status, speeds, strict=True))
         return Moment(
             time_s, story.index(time_s), decision, frozenset(record.solved_at(time_s)), status,
-            tuple(story.speed(i, time_s) for i in robots), goals, story.targets_at(decision),
+            speeds, goals, story.targets_at(decision),
             tuple(r for r in story.replans if r.time_s <= time_s + 1e-9))
 
     def picture(self, time_s: float) -> npt.NDArray[np.uint8]:

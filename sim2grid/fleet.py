@@ -10,6 +10,7 @@ Legend: R robots, F missions of a fleet, K kinds.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import msgspec
@@ -92,15 +93,16 @@ class Fleet:
         return tuple(body.base for body in self.bodies)
 
 
-def make_fleet(recipe: Recipe, count: int) -> Fleet:
-    """The first `count` missions of a recipe, on their ground.
+def make_fleet(recipe: Recipe, count: int,
+               change: Callable[[Ground], Ground] = lambda ground: ground) -> Fleet:
+    """The first `count` missions of a recipe, on their ground after a `change`.
 
     Raises InputError for numbers out of range, or ground that allows no mission.
     """
     size = (recipe.side, recipe.side)
     empty = Mission(Map(size, recipe.cell_m), tuple(
         Robot(name, kind, ("A",), (0, 0)) for name, kind in TEAM), (), recipe.site)
-    site = for_mission(empty)
+    site = change(for_mission(empty))
     passable = passable_cells(site, empty, {kind for _, kind in TEAM})
     drawn = [draw_mission(recipe, number, site, passable) for number in range(count)]
     return fleet_of([m for m, _ in drawn], [n for _, n in drawn], site, passable)

@@ -69,7 +69,7 @@ def timeline(story: Story) -> str:
     axis.set_ylim(len(names) - 0.5, -0.5)
     axis.set_xlim(0.0, end * 1.01 + 0.01)
     axis.set_xlabel("mission time, s")
-    return _svg(figure)
+    return svg(figure)
 
 
 def motion(story: Story, bases: Sequence[int]) -> str:
@@ -93,7 +93,7 @@ def motion(story: Story, bases: Sequence[int]) -> str:
     axes[0].legend(ncols=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False,
                    labelcolor=hexed(INK), fontsize=8)
     axes[2].set_xlabel("mission time, s")
-    return _svg(figure)
+    return svg(figure)
 
 
 def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any], float]]) -> str:
@@ -122,7 +122,7 @@ def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any], f
         axis.margins(x=0.15)
         if title == "success":
             axis.set_xlim(min(axis.get_xlim()[0], 0.9), 1.03)
-    return _svg(figure)
+    return svg(figure)
 
 
 def histograms(title: str, groups: dict[str, Sequence[float]]) -> str:
@@ -141,36 +141,37 @@ def histograms(title: str, groups: dict[str, Sequence[float]]) -> str:
         axis.set_title(f"{name}: median {np.median(values):.3g}", loc="right", fontsize=8,
                        color=hexed(INK), pad=2)
     axes[-1].set_xlabel(title)
-    return _svg(figure)
+    return svg(figure)
 
 
-def curves(panels: Sequence[tuple[str, dict[str, Sequence[tuple[float, Any]]]]], ylabel: str,
-           ylim: tuple[float, float] | None = None) -> str:
-    """Lines with intervals, a panel a quantity that was varied.
+def curves(columns: Sequence[tuple[str, dict[str, Sequence[tuple[float, Any]]],
+                                   dict[str, Sequence[tuple[float, Any]]]]]) -> Figure:
+    """Success above, seconds below, a column for each quantity that was varied.
 
-    Args:
-      panels: (what was varied, name of a line -> [(x, (value, low, high) or None)]).
-      ylabel: what the lines show.
-      ylim: their range.
+    Each column: (what was varied, success, seconds); lines by name, their points
+    (x, (value, low, high)), the second None where nothing was measured.
     """
-    figure, axes = _axes(WIDTH, 2.6, len(panels))
-    for axis, (title, lines) in zip(axes, panels, strict=True):
-        for i, (name, points) in enumerate(lines.items()):
-            kept = [(x, v) for x, v in points if v is not None and v[0] is not None]
-            if not kept:
-                continue
-            x = [point[0] for point in kept]
-            mean, low, high = np.array([point[1] for point in kept], float).T
-            color = hexed(robot_color(i))
-            axis.plot(x, mean, "o-", color=color, ms=4, lw=1.5, label=name)
-            axis.fill_between(x, low, high, color=color, alpha=0.18, lw=0)
-        axis.set_xlabel(title, fontsize=8)
-        if ylim:
-            axis.set_ylim(*ylim)
-    axes[0].set_ylabel(ylabel, fontsize=8, color=hexed(INK))
-    if len(panels[0][1]) > 1:
-        axes[0].legend(frameon=False, labelcolor=hexed(INK), fontsize=8)
-    return _svg(figure)
+    figure, axes = _axes(WIDTH * max(1.0, len(columns) / 4), 4.4, 2 * len(columns), grid_rows=2)
+    most = len(columns)
+    for k, (title, *both) in enumerate(columns):
+        for axis, lines in zip((axes[k], axes[most + k]), both, strict=True):
+            for i, (name, points) in enumerate(lines.items()):
+                kept = [(x, v) for x, v in points if v is not None and v[0] is not None]
+                if not kept:
+                    continue
+                x = [point[0] for point in kept]
+                mean, low, high = np.array([point[1] for point in kept], float).T
+                color = hexed(robot_color(i))
+                axis.plot(x, mean, "o-", color=color, ms=4, lw=1.5, label=name)
+                axis.fill_between(x, low, high, color=color, alpha=0.18, lw=0)
+        axes[k].set_ylim(-0.03, 1.05)
+        axes[most + k].set_ylim(bottom=0.0)
+        axes[most + k].set_xlabel(title)
+    for axis, label in ((axes[0], "success"), (axes[most], "mission seconds")):
+        axis.set_ylabel(label, fontsize=8, color=hexed(INK))
+    if len(columns[0][1]) > 1:
+        axes[0].legend(frameon=False, labelcolor=hexed(INK), fontsize=8, loc="lower left")
+    return figure
 
 
 def _thinned(count: int) -> npt.NDArray[np.int64]:
@@ -178,16 +179,18 @@ def _thinned(count: int) -> npt.NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int))
 
 
-def _axes(width: float, height: float, count: int, rows: bool = False
+def _axes(width: float, height: float, count: int, rows: bool = False, grid_rows: int = 1
           ) -> tuple[Figure, list[Axes]]:
-    """A figure without a screen on a dark ground, its axes side by side or, `rows`, stacked."""
+    """A figure without a screen on a dark ground, its axes side by side in `grid_rows` or,
+    `rows`, stacked.
+    """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained", facecolor=hexed(NIGHT))
     FigureCanvasSVG(figure)
-    grid = figure.subplots(count, 1, squeeze=False, sharex=True)[:, 0] if rows else figure.subplots(
-        1, count, squeeze=False)[0]
+    shape = (count, 1) if rows else (grid_rows, count // grid_rows)
+    grid = figure.subplots(*shape, squeeze=False, sharex=rows).ravel()
     for axis in grid:
         axis.set_facecolor(hexed(NIGHT))
         axis.tick_params(colors=hexed(STATES["waiting"]), labelsize=8)
@@ -201,7 +204,7 @@ def _axes(width: float, height: float, count: int, rows: bool = False
     return figure, list(grid)
 
 
-def _svg(figure: Figure) -> str:
+def svg(figure: Figure) -> str:
     """The figure as SVG text; the same figure gives the same text."""
     import matplotlib
 

@@ -25,6 +25,8 @@ COMMANDS = {
     "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),
     "evaluate execution": (
         "sim2grid.evaluate_command", "many missions in physics: success, cost and failures"),
+    "evaluate sensitivity": (
+        "sim2grid.sensitivity_command", "success and seconds against slope, friction, noise"),
     "evaluate traverse": (
         "moonteam.commands.evaluate_traverse", "each kind of robot on its own over a site"),
     "evaluate slopes": (

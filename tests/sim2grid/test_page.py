@@ -138,8 +138,8 @@ def test_plots_are_the_same_for_the_same_data():
     assert first == plots.histograms("seconds", groups)
     assert re.match(r"<\?xml.*<svg", first, re.DOTALL)
     assert plots.histograms("seconds", {"none": []}) == ""
-    curve = plots.curves([("slope", {"a": [(0.0, (1.0, 0.9, 1.0)), (1.0, None)]})], "success")
-    assert "<svg" in curve
+    line = {"a": [(0.0, (1.0, 0.9, 1.0)), (1.0, None)]}
+    assert "<svg" in plots.svg(plots.curves([("slope", line, line)]))
 
 
 def test_plots_of_a_long_record_stay_small(done):

@@ -1,0 +1,252 @@
+"""`moonteam evaluate sensitivity`: curves of success and seconds against what may go wrong."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+
+from moonteam import __version__, files
+from moonteam.errors import InputError
+
+if TYPE_CHECKING:
+    from sim2grid.evaluate import Row
+    from sim2grid.sensitivity import Setting
+
+
+@dataclass(frozen=True)
+class Args:
+    """Draw success and mission seconds against slope, boulders, friction, noise and delay.
+
+    One quantity is varied at a time over random missions of one site, as in `moonteam evaluate
+    execution`; the missions keep their numbers from value to value (one that changed ground
+    forbids is drawn anew).
+
+    - slope: degrees added to the ground.
+    - boulders: times the preset's.
+    - friction: of the ground.
+    - noise: m, error of the positions that the executor sees and steers by.
+    - delay: s, until a command reaches the controllers.
+
+    Files in --out: report.html and curves.png, report.json, and rows.jsonl, to which each mission
+    is added as it ends, so that --resume can go on.
+
+    Examples:
+      moonteam evaluate sensitivity --out runs/sensitivity
+      moonteam evaluate sensitivity --quantity slope friction --count 30 --out runs/grip
+      moonteam evaluate sensitivity --site highland --planner policy --out runs/high --resume
+    """
+
+    quantity: tuple[Literal["slope", "boulders", "friction", "noise", "delay"], ...] = (
+        "slope", "boulders", "friction", "noise", "delay")
+    """What is varied."""
+    site: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
+    """Preset of the ground."""
+    site_seed: int = 0
+    """Seed of the ground."""
+    count: int = 10
+    """Missions for each value."""
+    mode: tuple[Literal["barrier", "async"], ...] = ("async",)
+    """barrier: all robots decide together; async: each when it arrives."""
+    planner: Literal["policy", "exact", "greedy"] = "exact"
+    """Who decides."""
+    policy: str = "any_team"
+    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
+    decode: str = "argmax"
+    """How actions are read from the policy: argmax, sample or best-of-K."""
+    targets: int = 5
+    """Targets of each mission."""
+    side: int = 16
+    """Cells of a side of the map, each a metre."""
+    max_steps: int = 128
+    """Joint decisions after which a mission has failed."""
+    seed: int = 0
+    """Seed of the missions and the planners."""
+    backend: Literal["native", "mjx"] = "native"
+    """Physics engine: C MuJoCo, or MJX for accelerators."""
+    width: int = 25
+    """Worlds that the engine advances together."""
+    resume: bool = False
+    """Go on with the run in --out; the options must be the same."""
+    json: bool = False
+    """Print the report as one JSON document and nothing else."""
+    out: Path | None = None
+    """Output folder."""
+
+
+def run(args: Args) -> int:
+    """Runs what is not done yet, prints, saves."""
+    _check(args)
+    from moonteam.compilation import enable_cache
+
+    enable_cache()
+    from sim2grid.evaluate import Contender, contenders, maker
+    from sim2grid.fleet import Recipe
+    from sim2grid.sensitivity import run_setting, settings
+
+    who = Contender("closed", "barrier", args.planner,
+                    args.policy if args.planner == "policy" else None,
+                    args.decode if args.planner == "policy" else "argmax")
+    maker(who)  # refuses a policy that is not there before anything is written
+    chosen = contenders(("closed",), args.mode, [who])
+    recipe = Recipe(args.site, args.site_seed, args.seed, args.targets, args.side,
+                    max_steps=args.max_steps)
+    journal = _Journal(args)
+    interrupted, impossible = False, {}
+    try:
+        for setting in {s.key: s for s in settings(args.quantity)}.values():
+            said = run_setting(
+                setting, recipe, args.count, chosen, seed=args.seed, width=args.width,
+                backend=args.backend, done=journal.of(setting),
+                keep=lambda row, key=setting.key: journal.add(key, row),
+                progress=lambda title, done, total, key=setting.key: _progress(
+                    f"{key}: {title}", done, total))
+            if said:
+                impossible[setting.key] = said
+    except KeyboardInterrupt:
+        interrupted = True
+    report = _document(args, journal.rows, [c.name for c in chosen], impossible)
+    if interrupted:
+        report["interrupted"] = True
+    if args.out:
+        _save(args.out, report)
+    if args.json:
+        print(files.dump_json(report))
+    else:
+        _show(report)
+    if interrupted:
+        more = ": --resume goes on" if args.out else ""
+        print(f"moonteam: interrupted{more}", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _check(args: Args) -> None:
+    """Raises InputError for options out of range."""
+    for name, value, low, high in (
+            ("count", args.count, 1, 100_000), ("targets", args.targets, 1, 64),
+            ("side", args.side, 4, 128), ("max-steps", args.max_steps, 1, 100_000),
+            ("seed", args.seed, 0, 2**31), ("site-seed", args.site_seed, 0, 2**31),
+            ("width", args.width, 1, 4096)):
+        if not low <= value <= high:
+            raise InputError(f"--{name}", f"{value} is not allowed; {low} to {high}")
+    for name, chosen in (("quantity", args.quantity), ("mode", args.mode)):
+        if len(set(chosen)) < len(chosen) or not chosen:
+            raise InputError(f"--{name}", "give each once, and at least one")
+    if args.resume and args.out is None:
+        raise InputError("--resume", "needs the folder of the run to go on with: --out DIR")
+    if args.out is not None and args.out.exists() and not args.out.is_dir():
+        raise InputError("--out", f"{args.out} is a file; a folder is needed")
+
+
+class _Journal:
+    """The folder's rows.jsonl, each line a setting's key and a row; in memory without --out."""
+
+    def __init__(self, args: Args):
+        self.rows: dict[str, dict[tuple[str, int], Row]] = {}
+        self._path = args.out / "rows.jsonl" if args.out else None
+        if args.out is None or self._path is None:
+            return
+        plain = msgspec.json.decode(files.dump_json(
+            {"moonteam": __version__, "options": _options(args)}))
+        config = args.out / "config.json"
+        if args.resume:
+            if not config.exists():
+                raise InputError("--resume", f"{args.out} holds no run to go on with")
+            if msgspec.json.decode(files.read_text(config)) != plain:
+                raise InputError("--resume", f"{args.out} was made with other options")
+            self._read(files.read_text(self._path) if self._path.exists() else "")
+        files.write_json(config, plain)
+        files.write_text(self._path, "".join(
+            self._line(key, row) for key, rows in self.rows.items() for row in rows.values()))
+
+    def _read(self, text: str) -> None:
+        from sim2grid.evaluate import Row
+
+        for number, line in enumerate(text.splitlines(keepends=True), 1):
+            if not line.endswith("\n"):
+                return  # cut off by an interruption
+            try:
+                key, row = msgspec.json.decode(line, type=tuple[str, Row])
+            except msgspec.DecodeError as error:
+                raise InputError(self._path, f"line {number} is no row: {error}") from None
+            self._put(key, row)
+
+    def _put(self, key: str, row: Row) -> None:
+        self.rows.setdefault(key, {})[row.contender, row.number] = row
+
+    @staticmethod
+    def _line(key: str, row: Row) -> str:
+        return files.dump_json([key, row]) + "\n"
+
+    def of(self, setting: Setting) -> dict[tuple[str, int], Row]:
+        """What is done of a setting."""
+        return self.rows.get(setting.key, {})
+
+    def add(self, key: str, row: Row) -> None:
+        """Keeps a row."""
+        self._put(key, row)
+        if self._path:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(self._line(key, row))
+
+
+def _options(args: Args) -> dict[str, Any]:
+    """What the rows depend on."""
+    return {key: value for key, value in asdict(args).items()
+            if key not in ("json", "out", "resume")}
+
+
+def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: list[str],
+              impossible: dict[str, str]) -> dict[str, Any]:
+    """The report: a curve for each quantity and contender, and the rows behind them."""
+    from moonteam.evaluation import provenance
+    from sim2grid.sensitivity import SWEEPS, point, settings
+
+    words = ["moonteam", "evaluate", "sensitivity"]
+    for key, value in _options(args).items():
+        if value != getattr(Args, key):
+            words += [f"--{key.replace('_', '-')}",
+                      *map(str, value if isinstance(value, tuple) else [value])]
+    curves = [
+        {"quantity": quantity, "label": SWEEPS[quantity].label, "contender": name,
+         "points": [{"value": s.value, "impossible": impossible.get(s.key)} | point(
+             [row for (who, _), row in sorted(rows.get(s.key, {}).items()) if who == name],
+             args.seed) for s in settings([quantity])]}
+        for quantity in args.quantity for name in names]
+    return {"kind": "sensitivity", "title": "sensitivity of executions",
+            "meta": provenance.meta(shlex.join(words), args.seed), "options": _options(args),
+            "curves": curves,
+            "rows": [{"setting": key} | msgspec.to_builtins(row)
+                     for key, found in rows.items() for _, row in sorted(found.items())]}
+
+
+def _save(out: Path, report: dict[str, Any]) -> None:
+    from sim2grid.sensitivity_page import curves_figure, sensitivity_page
+
+    files.write_json(out / "report.json", report)
+    files.write_text(out / "report.html", sensitivity_page(report))
+    with files.replacing(out / "curves.png") as temporary:
+        figure = curves_figure(report)
+        figure.savefig(temporary, dpi=130, facecolor=figure.get_facecolor())
+
+
+def _show(report: dict[str, Any]) -> None:
+    """The points, for a person."""
+    for curve in report["curves"]:
+        print(f"{curve['label']} ({curve['contender']})")
+        for at in curve["points"]:
+            print(f"  {at['value']:>6g}  " + (at["impossible"] or (
+                f"{at['solved']} of {at['missions']} missions"
+                + ("" if at["seconds"] is None else f", {at['seconds']:.1f} s"))))
+
+
+def _progress(title: str, done: int, total: int) -> None:
+    """A line on standard error that is written over, if that is a terminal."""
+    if sys.stderr.isatty():
+        end = "\n" if done == total else ""
+        print(f"\r\x1b[K{title}: {done} of {total} missions", end=end, file=sys.stderr, flush=True)
