@@ -27,6 +27,8 @@ COMMANDS = {
         "sim2grid.evaluate_command", "many missions in physics: success, cost and failures"),
     "evaluate sensitivity": (
         "sim2grid.sensitivity_command", "success and seconds against slope, friction, noise"),
+    "evaluate preference": (
+        "moonteam.commands.evaluate_preference", "a policy's trade-off of time and effort"),
     "evaluate traverse": (
         "moonteam.commands.evaluate_traverse", "each kind of robot on its own over a site"),
     "evaluate slopes": (

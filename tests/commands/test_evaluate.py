@@ -10,7 +10,8 @@ import pytest
 from moonteam.cli import main
 from moonteam.evaluation import env_speed, timing
 from moonteam.evaluation.contenders import Planned
-from moonteam.policies import checkpoint, recurrent
+from moonteam.policies import checkpoint, entity, recurrent
+from moonteam.policies.entity import EntitySpec
 from moonteam.policies.recurrent import RecurrentSpec
 
 GOLDEN = Path("tests/golden/certified_optima.jsonl")
@@ -38,6 +39,20 @@ def policy(tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "tiny.safetensors"
     config = {"num_agents": 3, "num_targets": 5, "size": [32, 32], "width": 8}
     checkpoint.save_policy(path, checkpoint.PolicyFile("recurrent", config, params))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def any_team(tmp_path_factory):
+    """Random weights that seldom stay."""
+    spec = EntitySpec(width=8, heads=2, layers=1)
+    shapes = jax.eval_shape(lambda key: entity.init(spec, key), jax.random.key(0))
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda x: rng.normal(0, 0.3, x.shape).astype(np.float32), shapes)
+    params["stay"]["bias"] -= 5.0
+    path = tmp_path_factory.mktemp("policy") / "any.safetensors"
+    config = {"width": 8, "heads": 2, "layers": 1}
+    checkpoint.save_policy(path, checkpoint.PolicyFile("entity", config, params))
     return str(path)
 
 
@@ -87,6 +102,36 @@ def test_policies_stand_beside_planners(capsys, policy, tmp_path):
     shown = capsys.readouterr().out
     assert "makespan gap" in shown
     assert "optima solved here" in shown
+
+
+def test_a_policy_is_swept_from_time_to_effort(capsys, any_team, policy, tmp_path):
+    words = ["evaluate", "preference", str(GOLDEN), "--policy", any_team, "--limit", "6",
+             "--points", "3", "--decode", "best-of-2@0.5"]
+    document = output(capsys, *words, "--json", "--out", str(tmp_path))
+    exact = [row for row in document["rows"] if row["planner"] == "exact"]
+    assert [row["preference"] for row in exact] == [0.0, 0.5, 1.0]
+    assert exact[0]["makespan"] <= exact[1]["makespan"] <= exact[2]["makespan"]
+    assert exact[0]["moves"] >= exact[1]["moves"] >= exact[2]["moves"]
+    assert exact[0]["makespan"] < exact[2]["makespan"]
+    mine = [row for row in document["rows"] if row["planner"] == "policy"]
+    assert all(row["makespan"] >= exact[0]["makespan"] for row in mine)
+    assert (tmp_path / "preference.png").read_bytes()[:4] == b"\x89PNG"
+    assert "| preference | policy: success |" in (tmp_path / "table.md").read_text()
+    words[4] = policy
+    assert main(words) == 2
+    assert "takes no preference" in capsys.readouterr().err
+    assert main([*words[:5], "--points", "1"]) == 2
+
+
+def test_one_scenario_at_a_time_is_said(capsys, any_team):
+    words = ("evaluate", "grid", str(GOLDEN), "--limit", "3", "--planner", "policy", "--policy",
+             any_team, "--preference", "0.5", "--json")
+    batched, alone = output(capsys, *words), output(capsys, *words, "--alone")
+    assert batched["rows"] == alone["rows"]
+    assert alone["summary"][0]["planner"] == "policy(argmax, preference 0.5)"
+    assert "one scenario at a time" in alone["summary"][0]["note"]
+    assert "in batches" in batched["summary"][0]["note"]
+    assert alone["meta"]["command"].endswith("--alone")
 
 
 def test_replanning_has_the_oracle_and_both_forms(capsys, tmp_path):

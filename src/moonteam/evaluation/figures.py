@@ -88,3 +88,30 @@ def timing(path: Path, document: dict) -> None:
     figure.suptitle(document["title"], fontsize=11, x=0.01, ha="left", color=INK)
     with files.replacing(path) as temporary:
         figure.savefig(temporary, dpi=150)
+
+
+def preference(path: Path, document: dict) -> None:
+    """Mean makespan against mean moves over the preference, a line for each planner.
+
+    Without intervals: all points are means over the same scenarios, and differ far less than
+    the scenarios do.
+    """
+    figure, (axis,) = _axes(6.4, 4.6, 1)
+    rows = document["rows"]
+    styles = {"policy": (ORANGE, "o"), "exact": (BLUE, "s")}
+    for name in dict.fromkeys(row["planner"] for row in rows):
+        color, mark = styles[name]
+        part = [row for row in rows if row["planner"] == name]
+        x, y = ([row[key] for row in part] for key in ("moves", "makespan"))
+        axis.plot(x, y, "-", color=color, marker=mark, ms=5, lw=1.4, label=name)
+        for row in (part[0], part[-1]):
+            axis.annotate(f"{row['preference']:g}", (row["moves"], row["makespan"]), color=color,
+                          xytext=(6, 6), textcoords="offset points", fontsize=9)
+    axis.set_xlabel("mean moves of the team")
+    axis.set_ylabel("mean makespan, steps")
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(fontsize=9, frameon=False)
+    figure.suptitle(document["title"], fontsize=11, x=0.01, ha="left", color=INK)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150)

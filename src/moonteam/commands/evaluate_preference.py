@@ -1,0 +1,78 @@
+"""`moonteam evaluate preference`: one policy from time to effort, beside the exact trade-off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from moonteam import compilation, files, paths
+from moonteam.commands.evaluate_grid import command_line, load_set
+from moonteam.errors import InputError
+
+
+@dataclass(frozen=True)
+class Args:
+    """Sweep a policy's preference from 0 (time) to 1 (effort): mean makespan against mean moves.
+
+    Beside it stand the exact planner's points for the same weights, certified optimal plans of
+    the same scenarios (up to 12 targets).
+
+    Examples:
+      moonteam evaluate preference 3x7 --policy any_team --limit 200 --out runs/preference
+      moonteam evaluate preference 3x5 --policy any_team --decode best-of-16 --points 5 --json
+    """
+
+    set: tyro.conf.Positional[str]
+    """Scenario set (.jsonl), scenario (.json), or the name of a bundled set."""
+    policy: str
+    """Policy file (.safetensors) or the name of a bundled policy; of kind entity."""
+    decode: str = "argmax"
+    """As in `evaluate grid`; best-of-K keeps what the preference asks for."""
+    points: int = 11
+    """Preferences, evenly from 0 to 1."""
+    seed: int = 0
+    """Seed of sampling and of the bootstrap."""
+    limit: int | None = None
+    """Only the first so many scenarios of the set."""
+    json: bool = False
+    """Print the report as one JSON document and nothing else."""
+    markdown: bool = False
+    """Print the table as Markdown and nothing else."""
+    out: Path | None = None
+    """Folder for report.json, table.md and preference.png."""
+
+
+def run(args: Args) -> int:
+    """Evaluates, prints, saves."""
+    if args.points < 2:
+        raise InputError("--points", f"{args.points} is not allowed; at least 2")
+    compilation.enable_cache()
+    from moonteam.evaluation import decode, figures, preference, report
+    from moonteam.planners.learned import EntityBrain, Policy
+
+    how = decode.parse(args.decode)
+    found = load_set(args.set, args.limit)
+    policy = Policy.load(paths.find(args.policy, "policies", ".safetensors"))
+    if not isinstance(policy.brain, EntityBrain):
+        raise InputError(policy.path, "takes no preference: its network is not of kind entity")
+    command = command_line("evaluate preference", [args.set], {
+        "policy": args.policy, "decode": args.decode if args.decode != "argmax" else None,
+        "points": args.points if args.points != 11 else None, "seed": args.seed or None,
+        "limit": args.limit})
+    wishes = [round(i / (args.points - 1), 6) for i in range(args.points)]
+    title = f"{Path(args.set).stem}: {len(found)} scenarios, preference from time to effort"
+    document = preference.evaluate(found, policy, how, wishes, args.seed, title, command)
+    tables = [preference.pivot(document)]
+    if args.out:
+        files.write_json(args.out / "report.json", document)
+        files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
+        figures.preference(args.out / "preference.png", document)
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(report.plain_markdown(document, tables))
+    else:
+        report.show_plain(document, tables)
+    return 0
