@@ -10,9 +10,11 @@ controller is called once, then the physics takes its substeps with the controls
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -242,7 +244,9 @@ class MjxBackend:
 
 class NativeBackend:
     """C MuJoCo: `mujoco.batch` steps the worlds on a thread pool, bit-identical at any number
-    of threads; all controllers of all worlds are one jitted call between.
+    of threads; all controllers of all worlds are one jitted call on the CPU in between.
+
+    `physics_s` adds up the wall seconds spent in C MuJoCo, `controllers_s` those in controllers.
     """
 
     name = "native"
@@ -250,68 +254,121 @@ class NativeBackend:
     def __init__(self, scene: Scene, log_every: int = 5, threads: int = 0):
         self.scene = scene
         self.log_every = log_every
+        self.physics_s = self.controllers_s = 0.0
         self._threads = threads or os.cpu_count() or 1
         self._substeps = _substeps(scene)
         self._batch: Batch | None = None
-        self._reset = jax.jit(jax.vmap(
-            lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
-        # Called every control step, so jit's own fast dispatch rather than a compiled object.
-        self.controllers = jax.jit(jax.vmap(
-            self._control_world, in_axes=(None, 0, 0, 0, 0, 0)))
+        self._cpu = jax.local_devices(backend="cpu")[0]
+        self._surface = jax.device_put(scene.surface, self._cpu)
+        start = partial(_start_controls, scene.robots)
+        model = scene.model
+        self._memory = jax.eval_shape(
+            lambda *a: _strong(start(*a)), jnp.zeros(model.nq), jnp.zeros(model.nv))
+        self._told = jax.tree.map(lambda a: a[0], hold(scene, 1))
+        self._reset = jax.jit(jax.vmap(start))
+        # Called every control step: few, flat arrays, and jit's own fast dispatch.
+        self._controllers = jax.jit(
+            jax.vmap(self._control_world, in_axes=(None, 0, 0, 0)),
+            compiler_options=_on_one_thread())
 
     def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
         """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
-        return _at_rest(self.scene, self._reset, qpos, batch)
+        with jax.default_device(self._cpu):
+            return _at_rest(self.scene, self._reset, qpos, batch)
 
     def advance(
         self, state: WorldState, commands: Commands, num_control_steps: int
     ) -> tuple[WorldState, Log]:
-        """Runs `num_control_steps` (a multiple of log_every) with the commands held."""
+        """Runs `num_control_steps` (a multiple of log_every) with the commands held.
+
+        The arrays that it returns are NumPy's.
+        """
         _check_steps(num_control_steps, self.log_every)
-        commands = _strong(commands)
-        worlds = _Worlds(self._pool(state.qpos.shape[0]), state)
-        controls, samples, powers, propellants = _strong(state.control), [], [], []
+        batch, nu = state.qpos.shape[0], self.scene.model.nu
+        worlds = _Worlds(self._pool(batch), state)
+        told, memory = _flat(commands, batch), self._remember(state.control, batch)
+        samples = num_control_steps // self.log_every
+        qpos = np.empty((batch, samples, self.scene.model.nq), np.float32)
+        costs = np.zeros((batch, samples, 2 * len(self.scene.robots)), np.float32)
         for step in range(num_control_steps):
-            ctrl, controls, power, propellant = self.controllers(
-                self.scene.surface, *worlds.seen(), controls, commands)
-            worlds.step(np.asarray(ctrl), self._substeps)
-            moving = ~worlds.diverged[:, None]
-            powers.append(np.where(moving, power, 0.0))
-            propellants.append(np.where(moving, propellant, 0.0))
+            begun = time.perf_counter()
+            out, memory = self._controllers(self._surface, worlds.seen(), memory, told)
+            rows = np.asarray(out)
+            ready = time.perf_counter()
+            worlds.step(rows[:, :nu], self._substeps)
+            self.controllers_s += ready - begun
+            self.physics_s += time.perf_counter() - ready
+            sample = step // self.log_every
+            costs[:, sample] += np.where(worlds.diverged[:, None], 0.0, rows[:, nu:])
             if (step + 1) % self.log_every == 0:
-                samples.append(worlds.qpos.astype(np.float32))
-        log = Log(jnp.asarray(np.stack(samples, axis=1)), self._means(powers),
-                  self._means(propellants))
-        return worlds.state(controls), log
+                qpos[:, sample] = worlds.qpos
+        power, propellant = np.split(costs / self.log_every, 2, axis=2)
+        log: Any = (qpos, power, propellant)
+        return worlds.state(_shaped(self._memory, np.asarray(memory))), Log(*log)
 
     def compile(self, batch: int, num_control_steps: int) -> float:
         """Compiles the controllers for B worlds; returns the seconds it took."""
         _check_steps(num_control_steps, self.log_every)
         state = self.reset(batch=batch)
+        worlds = _Worlds(self._pool(batch), state)
         begun = time.perf_counter()
-        jax.block_until_ready(self.controllers(
-            self.scene.surface, *(np.asarray(a) for a in (state.time, state.qpos, state.qvel)),
-            state.control, hold(self.scene, batch)))
+        jax.block_until_ready(self._controllers(
+            self._surface, worlds.seen(), self._remember(state.control, batch),
+            _flat(hold(self.scene, batch), batch)))
         return time.perf_counter() - begun
 
-    def _control_world(self, surface: Surface, time: Array, qpos: Array, qvel: Array,
-                       controls: Controls, commands: Commands
-                       ) -> tuple[Array, Controls, Array, Array]:
+    def _control_world(self, surface: Surface, seen: Array, memory: Array, told: Array
+                       ) -> tuple[Array, Array]:
+        """One world: seen [1 + nq + nv], controllers' memory and commands side by side.
+
+        Returns ctrl, power and propellant side by side [nu + 2 R], and the new memory.
+        """
+        now, qpos, qvel = jnp.split(seen, (1, 1 + self.scene.model.nq))
         ctrl, controls, power, propellant = _call_controllers(
-            self.scene.robots, self.scene.model.nu, surface, time, qpos, qvel, controls,
-            commands)
-        return ctrl, _strong(controls), power, propellant
+            self.scene.robots, self.scene.model.nu, surface, now[0], qpos, qvel,
+            _shaped(self._memory, memory), _shaped(self._told, told))
+        leaves = [leaf.reshape(-1).astype(jnp.float32) for leaf in jax.tree.leaves(controls)]
+        return jnp.concatenate([ctrl, power, propellant]), jnp.concatenate(leaves)
+
+    def _remember(self, controls: Controls, batch: int) -> Array:
+        """The controllers' memory [B, n] where their next one will be, lest jit compile twice."""
+        return jax.device_put(_flat(controls, batch), self._cpu)
 
     def _pool(self, batch: int) -> Batch:
         if self._batch is None or self._batch.nsim != batch:
             self._batch = Batch(self.scene.model, batch, min(self._threads, batch))
         return self._batch
 
-    def _means(self, rows: list[np.ndarray]) -> Array:
-        """Rows [B, R], one a control step, averaged over each sample: [B, T, R]."""
-        table = np.stack(rows, axis=1)
-        shape = (table.shape[0], -1, self.log_every, table.shape[2])
-        return jnp.asarray(table.reshape(shape).mean(axis=2), jnp.float32)
+
+def _on_one_thread() -> dict[str, str | bool]:
+    """XLA's options, where it knows them, to run a program on the thread that calls it.
+
+    A call of the controllers is some hundred operations of a microsecond or less; XLA would
+    hand part of them to other threads, which costs more than the operations.
+    """
+    options: dict[str, str | bool] = {
+        "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=options).lower(0).compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options
+
+
+def _flat(tree: Any, batch: int) -> np.ndarray:
+    """The leaves [B, ...] of a tree side by side: [B, n] float32. `_shaped` undoes it."""
+    leaves = [np.asarray(leaf, np.float32).reshape(batch, -1) for leaf in jax.tree.leaves(tree)]
+    return np.concatenate(leaves, axis=1)
+
+
+def _shaped(like: Any, rows: Any) -> Any:
+    """Rows [..., n] cut into the leaves of `like`, a tree of one world: leaves [..., *shape]."""
+    leaves, treedef = jax.tree.flatten(like)
+    ends = np.cumsum([0] + [math.prod(leaf.shape) for leaf in leaves]).tolist()
+    lead = rows.shape[:-1]
+    parts = [rows[..., i:j].reshape(lead + leaf.shape).astype(leaf.dtype)
+             for leaf, i, j in zip(leaves, ends[:-1], ends[1:], strict=True)]
+    return jax.tree.unflatten(treedef, parts)
 
 
 class _Worlds:
@@ -326,11 +383,19 @@ class _Worlds:
         self.qpos[:], self._qvel[:] = np.asarray(state.qpos), np.asarray(state.qvel)
         self._act[:], self._warmstart[:] = np.asarray(state.act), np.asarray(state.warmstart)
         self.diverged = np.array(state.diverged)
+        width = 1 + self.qpos.shape[1] + self._qvel.shape[1]
+        self._seen = np.empty((len(self.qpos), width), np.float32)
 
-    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Time [B], qpos [B, nq], qvel [B, nv] in the controllers' precision."""
-        return (self._time.astype(np.float32).reshape(-1), self.qpos.astype(np.float32),
-                self._qvel.astype(np.float32))
+    def seen(self) -> np.ndarray:
+        """Time, qpos and qvel side by side [B, 1 + nq + nv] in the controllers' precision.
+
+        The same memory at every call.
+        """
+        nq = self.qpos.shape[1]
+        self._seen[:, 0] = self._time
+        self._seen[:, 1:1 + nq] = self.qpos
+        self._seen[:, 1 + nq:] = self._qvel
+        return self._seen
 
     def step(self, ctrl: np.ndarray, substeps: int) -> None:
         """One control step of the worlds that still run; one that blows up goes back to
@@ -338,23 +403,26 @@ class _Worlds:
         """
         before = self.qpos.copy()
         self._ctrl[:] = ctrl
-        running = np.flatnonzero(~self.diverged)
-        if running.size:
-            self._batch.step(ids=running, nstep=substeps)
-        bad = ~np.isfinite(self.qpos).all(axis=1) | ~np.isfinite(self._qvel).all(axis=1)
-        bad |= ~(np.abs(self._qvel).max(axis=1) <= MAX_SPEED)
-        self.diverged |= bad
-        self.qpos[bad] = before[bad]
-        self._qvel[bad] = self._warmstart[bad] = 0.0
+        if not self.diverged.any():
+            self._batch.step(nstep=substeps)
+        elif not self.diverged.all():
+            self._batch.step(ids=np.flatnonzero(~self.diverged), nstep=substeps)
+        # Not a number makes this comparison false, too.
+        bad = ~(np.abs(self._qvel).max(axis=1) <= MAX_SPEED)
+        bad |= ~np.isfinite(self.qpos).all(axis=1)
+        if bad.any():
+            self.diverged |= bad
+            self.qpos[bad] = before[bad]
+            self._qvel[bad] = self._warmstart[bad] = 0.0
 
     def state(self, controls: Controls) -> WorldState:
         """The worlds as they now are."""
-        def single(rows: np.ndarray) -> Array:
-            return jnp.asarray(rows, jnp.float32)
+        def single(rows: np.ndarray) -> Any:
+            return rows.astype(np.float32)
 
-        return WorldState(
-            single(self._time.reshape(-1)), single(self.qpos), single(self._qvel),
-            single(self._act), single(self._warmstart), jnp.asarray(self.diverged), controls)
+        gone: Any = self.diverged
+        return WorldState(single(self._time), single(self.qpos), single(self._qvel),
+                          single(self._act), single(self._warmstart), gone, controls)
 
 
 def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> WorldState:
