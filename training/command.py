@@ -16,18 +16,20 @@ from training import config as configs
 from training.config import Config
 
 if TYPE_CHECKING:
-    from training import imitate
+    from training import imitate, refine
 
 IMITATION = ("quick", "any_team")
 """Presets that imitate the exact planner; see `training.imitate`."""
+REFINE = "refine"
+"""MAPPO from an imitated policy; see `training.refine`."""
 
 
 @dataclass(frozen=True)
 class Args:
     """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's), small.
 
-    The presets quick and any_team imitate the exact planner instead, for teams of any size; they
-    have options of their own: moonteam train quick --help.
+    The presets quick and any_team imitate the exact planner instead, for teams of any size, and
+    refine goes on from there by MAPPO; they have options of their own: moonteam train quick --help.
 
     The first word after `train` is the preset; every number of it can be changed by an option.
 
@@ -52,7 +54,7 @@ class Args:
     """One JSON document on standard output: the report, or the dry run's table."""
 
 
-def parse(words: list[str]) -> Args | imitate.Args:
+def parse(words: list[str]) -> Args | imitate.Args | refine.Args:
     """Arguments of the command; the preset's numbers are the defaults of all options.
 
     Raises InputError for a preset that does not exist.
@@ -61,6 +63,10 @@ def parse(words: list[str]) -> Args | imitate.Args:
         from training import imitate
 
         return imitate.parse(words)
+    if words and words[0] == REFINE:
+        from training import refine
+
+        return refine.parse(words[1:])
     named = bool(words) and not words[0].startswith("-")
     asks_help = any(word in ("-h", "--help") for word in words)
     if not named and not asks_help:
@@ -71,15 +77,15 @@ def parse(words: list[str]) -> Args | imitate.Args:
                     args=rest, description=inspect.getdoc(Args))
 
 
-def run(args: Args | imitate.Args) -> int:
+def run(args: Args | imitate.Args | refine.Args) -> int:
     """Trains, or describes; returns the exit code."""
     from moonteam.compilation import enable_cache
 
     enable_cache()
     if not isinstance(args, Args):
-        from training import imitate
+        from training import imitate, refine
 
-        return imitate.run(args)
+        return refine.run(args) if isinstance(args, refine.Args) else imitate.run(args)
     if args.dry_run:
         from training import account
 

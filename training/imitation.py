@@ -372,6 +372,11 @@ class Dagger:
         """All rounds are made."""
         return self.number >= self.config.rounds
 
+    @property
+    def states_a_round(self) -> int:
+        """States labelled in a round."""
+        return sum(self.config.num_envs // f.shrink for f in self.config.families)
+
     def round(self) -> Round:
         """Visits, labels and learns, each family once."""
         config = self.config

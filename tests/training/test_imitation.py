@@ -12,9 +12,10 @@ from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies.entity import EntitySpec
 from moonteam.scenario import Agent, Scenario, Target
-from training import imitate
+from training import run_folder
 from training.imitation import TIE_BREAK, Dagger, Family, Imitation, Memory, begin, label
 from training.loop import Stop
+from training.run_folder import Run
 
 SMALL = Family(2, 2, sides=(4, 6), max_steps=24)
 TINY = Imitation(families=(SMALL,), spec=EntitySpec(width=16, heads=2, layers=1), rounds=30,
@@ -23,7 +24,7 @@ TINY = Imitation(families=(SMALL,), spec=EntitySpec(width=16, heads=2, layers=1)
 
 def test_labels_point_where_the_exact_planner_goes():
     walk = begin(SMALL, None, jax.random.key(3), 24)
-    sample = label(None, walk, threads=1)
+    sample = label(SMALL, None, walk, threads=1)
     problem, cells = sample.states.problem, sample.states.cells
     for e in range(24):
         wish = float(sample.preference[e])
@@ -45,7 +46,7 @@ def test_labels_point_where_the_exact_planner_goes():
 def test_memory_is_a_ring():
     memory = Memory(8)
     walk = begin(SMALL, None, jax.random.key(0), 4)
-    sample = label(None, walk, threads=1)
+    sample = label(SMALL, None, walk, threads=1)
     for value in range(3):
         memory.add(sample._replace(place=np.full(4, value, np.int32)))
     assert memory.rows is not None
@@ -63,18 +64,18 @@ def test_learning_lowers_the_loss():
 @pytest.mark.parametrize("family", [SMALL, Family(3, 2, sides=(6, 6), max_steps=24, grounds=3)],
                          ids=["open", "blocked"])
 def test_a_resumed_run_is_the_same_run(tmp_path, family, monkeypatch):
-    monkeypatch.setattr(imitate, "SCENARIOS", 8)
+    monkeypatch.setattr(run_folder, "SCENARIOS", 8)
     config = dataclasses.replace(TINY, families=(family,))
-    whole = imitate.Run("tiny", config, tmp_path / "whole", False)
+    whole = Run("tiny", "imitation", Dagger(config), tmp_path / "whole", False)
     assert whole.train(Stop())
-    begun = imitate.Run("tiny", config, tmp_path / "parts", False)
-    begun.dagger.round()
-    begun.dagger.round()
+    begun = Run("tiny", "imitation", Dagger(config), tmp_path / "parts", False)
+    begun.work.round()
+    begun.work.round()
     begun.save()
-    again = imitate.Run("tiny", config, tmp_path / "parts", True)
-    assert again.dagger.number == 2
+    again = Run("tiny", "imitation", Dagger(config), tmp_path / "parts", True)
+    assert again.work.number == 2
     assert again.train(Stop())
-    for a, b in zip(jax.tree.leaves(whole.dagger.learner), jax.tree.leaves(again.dagger.learner),
+    for a, b in zip(jax.tree.leaves(whole.work.learner), jax.tree.leaves(again.work.learner),
                     strict=True):
         np.testing.assert_array_equal(a, b)
     report = again.finish()
@@ -86,22 +87,24 @@ def test_a_resumed_run_is_the_same_run(tmp_path, family, monkeypatch):
     planner.reset(start)
     assert planner.act(start).shape == (1,)
     with pytest.raises(InputError, match="already holds a run"):
-        imitate.Run("tiny", config, tmp_path / "parts", False)
+        Run("tiny", "imitation", Dagger(config), tmp_path / "parts", False)
+    other = dataclasses.replace(config, lr=1.0)
     with pytest.raises(InputError, match="other numbers"):
-        imitate.Run("tiny", dataclasses.replace(config, lr=1.0), tmp_path / "parts", True)
+        Run("tiny", "imitation", Dagger(other), tmp_path / "parts", True)
 
 
 def test_a_torn_state_is_named(tmp_path):
-    run = imitate.Run.__new__(imitate.Run)
+    run = Run.__new__(Run)
     run.state_file = tmp_path / "state.npz"
     run.state_file.write_bytes(b"PK\x03\x04 torn")
-    run.dagger = Dagger.__new__(Dagger)
+    run.work = Dagger.__new__(Dagger)
     with pytest.raises(InputError, match="is torn"):
         run._load()
 
 
 def test_impossible_numbers():
-    with pytest.raises(InputError, match="the oracle takes 1 to 12"):
+    with pytest.raises(InputError, match="the planner takes 1 to 12"):
         Imitation(families=(Family(3, 20),))
+    Imitation(families=(Family(3, 20, iterations=50),))
     with pytest.raises(InputError, match="capacity"):
         dataclasses.replace(TINY, capacity=50)

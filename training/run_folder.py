@@ -1,0 +1,213 @@
+"""A run in one folder, resumable: `config.json`, `metrics.jsonl`, `checkpoints/state.npz`
+(everything a resumed run needs) and, at the end, `policy.safetensors`, `report.json`, `curve.png`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any, Protocol
+from zipfile import BadZipFile
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+
+from moonteam import files
+from moonteam.errors import InputError
+from moonteam.evaluation.progress import track
+from moonteam.evaluation.provenance import commit
+from moonteam.policies.checkpoint import PolicyFile, save_policy
+from training.imitation import Imitation, Learner, Memory, Sample, Walk, spread_walk
+from training.loop import Stop, describe_device
+from training.refinement import Refinement
+from training.scores import HeldOut, family_row
+from training.sharding import everywhere
+
+CHECKPOINT_SECONDS = 60.0
+SCENARIOS = 256
+EVAL_EVERY = 100
+
+
+class Round(Protocol):
+    """What a round reports."""
+
+    @property
+    def loss(self) -> float:
+        """Of its last gradient steps, in the mean."""
+        ...
+
+
+class Work(Protocol):
+    """A training in progress: `Dagger` or `Refiner`."""
+
+    config: Imitation | Refinement
+    number: int
+    learner: Learner
+    walks: list[Walk]
+    memories: list[Memory]
+
+    @property
+    def done(self) -> bool:
+        """All rounds are made."""
+        ...
+
+    @property
+    def states_a_round(self) -> int:
+        """States visited and labelled in a round."""
+        ...
+
+    def round(self) -> Round:
+        """Makes one."""
+        ...
+
+
+class Run:
+    """One training in one folder."""
+
+    def __init__(self, name: str, method: str, work: Work, out: Path, resume: bool,
+                 source: str | None = None):
+        """`source`: what the parameters it begins with come from, if not from the seed.
+
+        Raises InputError if the folder holds a run that this one may not go on with.
+        """
+        self.name, self.method, self.work, self.out = name, method, work, out
+        self.state_file = out / "checkpoints" / "state.npz"
+        plain = self._recipe = msgspec.json.decode(files.dump_json(
+            dataclasses.asdict(work.config) | ({"source": source} if source else {})))
+        stored = out / "config.json"
+        if stored.exists() and (resume or self.state_file.exists()):
+            if not resume:
+                raise InputError(out, "already holds a run; --resume goes on with it, or choose "
+                                 "another --out")
+            if msgspec.json.decode(stored.read_bytes()) != plain:
+                raise InputError(stored, "was started with other numbers; a resumed run must keep "
+                                 "them")
+        files.write_json(stored, plain)
+        self.seconds = 0.0
+        self.rows: list[dict[str, Any]] = []
+        if resume and self.state_file.exists():
+            self._load()
+        self.held_out = [HeldOut(f, SCENARIOS // f.shrink) for f in work.config.families]
+
+    def train(self, stop: Stop) -> bool:
+        """Runs to the end or until asked to stop; True when it reached the end."""
+        work, saved = self.work, time.monotonic()
+        if not self.rows:
+            self._record(None)
+        for _ in track(range(work.number, work.config.rounds), self.name,
+                       work.config.rounds - work.number):
+            if stop.asked:
+                break
+            begun = time.monotonic()
+            report = work.round()
+            self.seconds += time.monotonic() - begun
+            if work.number % EVAL_EVERY == 0 or work.done:
+                self._record(report)
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                self.save()
+                saved = time.monotonic()
+        self.save()
+        return work.done
+
+    def _record(self, report: Round | None) -> None:
+        work = self.work
+        row = {"round": work.number, "seconds": self.seconds,
+               **(report._asdict() if report else {}),
+               "labelled": work.number * work.states_a_round,
+               "families": [family_row(f, h, work.config.spec, work.learner.mean)
+                            for f, h in zip(work.config.families, self.held_out, strict=True)]}
+        self.rows.append(row)
+        files.write_text(self.out / "metrics.jsonl",
+                         "".join(files.dump_json(r) + "\n" for r in self.rows))
+
+    def save(self) -> None:
+        """Everything a resumed run needs, whole or not at all."""
+        arrays = {f"leaf{i}": leaf for i, leaf in enumerate(_leaves(self.work))}
+        about = {"number": self.work.number, "seconds": self.seconds, "rows": self.rows,
+                 "counts": [m.count for m in self.work.memories]}
+        with files.replacing(self.state_file) as temporary, temporary.open("wb") as out:
+            arrays["about"] = np.frombuffer(files.dump_json(about).encode(), np.uint8)
+            np.savez(out, allow_pickle=False, **arrays)
+
+    def _load(self) -> None:
+        work = self.work
+        try:
+            with self.state_file.open("rb") as raw, np.load(raw) as stored:
+                about = msgspec.json.decode(stored["about"].tobytes())
+                arrays = [stored[f"leaf{i}"] for i in range(len(stored.files) - 1)]
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise InputError(self.state_file, f"is torn ({error}); delete it to start again"
+                             ) from None
+        work.number, self.seconds, self.rows = about["number"], about["seconds"], about["rows"]
+        _restore(work, arrays, about["counts"])
+
+    def finish(self) -> dict[str, Any]:
+        """Writes policy, curve and report of a run that reached its end; returns the report."""
+        config = self.work.config
+        recipe = {"preset": self.name, "method": self.method, **self._recipe}
+        params = jax.device_get(self.work.learner.mean)
+        save_policy(self.out / "policy.safetensors",
+                    PolicyFile("entity", dataclasses.asdict(config.spec), params, recipe,
+                               commit() or "unknown"))
+        report = {"preset": self.name, "method": self.method, "seed": config.seed,
+                  "seconds": self.seconds, "device": describe_device(), "commit": commit(),
+                  **self.rows[-1]}
+        files.write_json(self.out / "report.json", report)
+        draw_curve(self.out / "curve.png", {self.name: self.rows})
+        return report
+
+
+def _leaves(work: Work) -> list[np.ndarray]:
+    """Learner, environments and memories as host arrays, keys as their raw words."""
+    walks = [w._replace(key=jax.random.key_data(w.key)) for w in work.walks]
+    tree = (work.learner, walks, [m.rows for m in work.memories])
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def _restore(work: Work, arrays: list[np.ndarray], counts: list[int]) -> None:
+    """Puts the leaves back; memories take the shapes of what they hold."""
+    walks = [w._replace(key=jax.random.key_data(w.key)) for w in work.walks]
+    fixed, shape = jax.tree.flatten((work.learner, walks))
+    learner, walks = jax.tree.unflatten(shape, [jnp.asarray(a) for a in arrays[:len(fixed)]])
+    work.learner = everywhere(learner)
+    work.walks = [spread_walk(w._replace(key=jax.random.wrap_key_data(w.key))) for w in walks]
+    rest = arrays[len(fixed):]
+    for memory, walk, count in zip(work.memories, work.walks, counts, strict=False):
+        sample = Sample(walk.states, walk.place, walk.preference, walk.place)
+        like = jax.tree.structure(sample)
+        size = like.num_leaves
+        memory.rows, rest = jax.tree.unflatten(like, rest[:size]), rest[size:]
+        memory.count = count
+
+
+def draw_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
+    """Success and gaps over labelled states: every family of one run, or the mean of each of
+    several runs.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 3)
+    for name, rows in runs.items():
+        states = [row["labelled"] for row in rows]
+        for axis, key in zip(axes, ("success", "makespan_gap", "moves_gap"), strict=True):
+            table = np.array([[family[key] for family in row["families"]] for row in rows])
+            if len(runs) > 1:
+                axis.plot(states, table.mean(axis=1), label=name)
+                continue
+            for i, family in enumerate(rows[-1]["families"]):
+                axis.plot(states, table[:, i], label=family["family"])
+    for axis, title in zip(axes, ("success, argmax, preference 0", "makespan gap, preference 0",
+                                  "moves gap, preference 1"), strict=True):
+        axis.set_title(title)
+        axis.set_xlabel("labelled states")
+    for axis in axes[1:]:
+        axis.set_yscale("symlog", linthresh=0.01)
+    axes[0].legend(fontsize=7)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120)
