@@ -107,9 +107,10 @@ class Run:
 def run(args: Args) -> int:
     """Runs the mission and writes its folder; the exit code says whether it succeeded."""
     _check(args)
-    from moonteam.compilation import enable_cache
+    from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
+    call_at_once()
     if args.viewer:
         from sim2grid.viewer import check_display
 

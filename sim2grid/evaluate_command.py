@@ -95,9 +95,10 @@ class Args:
 def run(args: Args) -> int:
     """Evaluates, prints, saves."""
     _check(args)
-    from moonteam.compilation import enable_cache
+    from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
+    call_at_once()
     from moonteam.evaluation import provenance
     from sim2grid.summary import document
 

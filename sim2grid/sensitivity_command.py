@@ -81,9 +81,10 @@ class Args:
 def run(args: Args) -> int:
     """Runs what is not done yet, prints, saves."""
     _check(args)
-    from moonteam.compilation import enable_cache
+    from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
+    call_at_once()
     from sim2grid.evaluate import Contender, contenders, maker
     from sim2grid.fleet import Recipe
     from sim2grid.sensitivity import run_setting, settings

@@ -57,3 +57,15 @@ def enable_cache() -> None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def call_at_once() -> None:
+    """Runs programs for the CPU on the thread that calls them; call it before any of JAX.
+
+    The native engine calls its controllers a hundred times a simulated second: handing each
+    call to another thread and waiting for it took longer than the controllers themselves. Not
+    for training, which keeps several CPU devices at work at once.
+    """
+    import jax
+
+    jax.config.update("jax_cpu_enable_async_dispatch", False)

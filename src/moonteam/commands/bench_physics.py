@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import os
-import platform
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from moonteam import files
+from moonteam import compilation, files
 from moonteam.errors import InputError
+
+if TYPE_CHECKING:
+    from moonteam.physics.scene import Scene
 
 
 @dataclass(frozen=True)
 class Args:
     """Steps a second and real-time factor of the three-robot scene on both backends.
 
-    Every pair of a backend and a number of worlds is one row. Compilation is timed apart,
-    controllers apart, and for native the physics without controllers too. steps_per_s counts
-    the steps of all worlds, controllers included; the real-time factor adds up all worlds.
+    Every pair of a backend and a number of worlds is one row. steps_per_s counts the steps of
+    all worlds, controllers included, physics_steps_per_s without them; the real-time factor
+    adds up all worlds. With --compilation the time to compile is taken in fresh processes too,
+    without and with the cache. Run it on a quiet machine.
 
     Examples:
       moonteam bench physics
+      moonteam bench physics --compilation --markdown
       moonteam bench physics --backend native --worlds 1 64 --threads 1 2 --json
       moonteam bench physics --backend mjx --worlds 1 1024 --out runs/bench
     """
@@ -47,11 +52,14 @@ class Args:
     seed: int = 0
     """of the ground"""
 
-    cache: bool = True
-    """use the compilation cache on disk; --no-cache times a cold compilation"""
+    compilation: bool = False
+    """time the compilation for one world in fresh processes, cold and from the cache"""
 
     json: bool = False
     """print one JSON document and nothing else"""
+
+    markdown: bool = False
+    """print the tables as Markdown and nothing else"""
 
     out: Path | None = None
     """folder for bench_physics.json"""
@@ -63,39 +71,95 @@ def run(args: Args) -> int:
         raise InputError("--worlds", "at least one number, each at least 1")
     if not 33 <= args.samples <= 1025:
         raise InputError("--samples", f"{args.samples} is not allowed; 33 to 1025")
-    if args.cache:
-        from moonteam.compilation import enable_cache
-
-        enable_cache()
+    if min(args.threads, default=1) < 1:
+        raise InputError("--threads", "each at least 1")
+    compilation.enable_cache()
+    compilation.call_at_once()
     from moonteam.physics import bench
 
     scene = bench.three_robots(args.site, args.seed, args.samples)
-    cpus = len(os.sched_getaffinity(0))
-    threads = args.threads or tuple(dict.fromkeys((1, cpus)))
     rows = []
-    for name in dict.fromkeys(args.backend):
-        for batch in dict.fromkeys(args.worlds):
-            for count in threads if name == "native" and batch > 1 else threads[:1]:
-                rows.append(bench.measure(scene, name, batch, args.seconds, count))
-                if not args.json:
-                    _show(rows[-1])
-    report = {
-        "command": "bench physics", "device": bench.device_name(),
-        "cpu": platform.processor() or platform.machine(), "cpus": cpus,
-        "site": args.site, "seed": args.seed, "samples": args.samples, "cache": args.cache,
-        "nv": scene.model.nv, "dt": scene.model.opt.timestep, "seconds": args.seconds,
-        "boulders": len(scene.site.boulders), "rows": rows}
+    for name, batch, threads in _loads(args):
+        rows.append(bench.measure(scene, name, batch, args.seconds, threads))
+        if not (args.json or args.markdown):
+            _show(rows[-1])
+    site = ["--site", args.site, "--samples", str(args.samples), "--seed", str(args.seed)]
+    compiled = [bench.compile_times(name, 1, site)
+                for name in dict.fromkeys(args.backend)] if args.compilation else []
+    report = _document(args, scene, rows, compiled)
     if args.out is not None:
         files.write_json(args.out / "bench_physics.json", report)
     if args.json:
         print(files.dump_json(report))
+    elif args.markdown:
+        from moonteam.evaluation.report import plain_markdown
+
+        print(plain_markdown(report, tables(report)))
+    else:
+        for row in compiled:
+            print(f"{row['backend']}, {row['worlds']} worlds: compiled in {row['cold_s']:.1f} s, "
+                  f"from the cache in {row['cached_s']:.1f} s")
     return 0
+
+
+def _loads(args: Args) -> Iterator[tuple[str, int, int]]:
+    """Backend, worlds and threads of each row."""
+    threads = args.threads or tuple(dict.fromkeys((1, len(os.sched_getaffinity(0)))))
+    for name in dict.fromkeys(args.backend):
+        for batch in dict.fromkeys(args.worlds):
+            for count in threads if name == "native" and batch > 1 else threads[:1]:
+                yield name, batch, count
+
+
+def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) -> dict[str, Any]:
+    from moonteam.evaluation import provenance
+    from moonteam.physics import bench
+    from moonteam.robots.base import CONTROL_PERIOD
+
+    default, words = Args(), ["moonteam", "bench", "physics"]
+    for name in ("backend", "worlds", "threads", "site", "samples", "seconds", "seed"):
+        value = getattr(args, name)
+        if value != getattr(default, name):
+            several = value if isinstance(value, tuple) else (value,)
+            words += [f"--{name}", *(str(one) for one in several)]
+    command = " ".join([*words, "--compilation"] if args.compilation else words)
+    model, sites = scene.model, scene.site
+    notes = [
+        f"Three robots (nv {model.nv}) driving on {args.site}, {args.samples} x {args.samples} "
+        f"heights, {len(sites.boulders)} boulders, physics step "
+        f"{1000 * model.opt.timestep:g} ms, controllers every {1000 * CONTROL_PERIOD:g} ms, "
+        f"{args.seconds:g} s a row.",
+        "Steps and real-time factor of all worlds together. CPU: processor seconds for one "
+        "simulated second of one world. Memory: most that the process had so far."]
+    return {
+        "title": "physics speed", "command": "bench physics", "device": bench.device_name(),
+        "cpus": len(os.sched_getaffinity(0)), "site": args.site, "seed": args.seed,
+        "samples": args.samples, "nv": model.nv, "dt": model.opt.timestep,
+        "seconds": args.seconds, "boulders": len(sites.boulders), "rows": rows,
+        "compilation": compiled, "notes": notes, "meta": provenance.meta(command, args.seed)}
+
+
+def tables(document: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
+    """Titles and rows: speeds, and times to compile if they were taken."""
+    titles = ["engine", "worlds", "threads", "steps/s", "physics alone", "controllers add",
+              "times real time", "CPU", "memory, MB"]
+    rows = [[row["backend"], str(row["worlds"]), str(row.get("threads", "")),
+             f"{row['steps_per_s']:,.0f}", f"{row['physics_steps_per_s']:,.0f}",
+             f"{100 * row['controllers_add']:.0f} %", f"{row['real_time_factor']:,.1f}",
+             f"{row['cpu_s']:.4f} s", f"{row['peak_memory_mb']:,.0f}"]
+            for row in document["rows"]]
+    out = [(titles, rows)]
+    if document["compilation"]:
+        out.append((["compilation, one world", "cold", "from the cache"],
+                    [[row["backend"], f"{row['cold_s']:.1f} s", f"{row['cached_s']:.1f} s"]
+                     for row in document["compilation"]]))
+    return out
 
 
 def _show(row: dict[str, Any]) -> None:
     threads = f", {row['threads']} threads" if "threads" in row else ""
     print(f"{row['backend']}, {row['worlds']} worlds{threads}: {row['steps_per_s']:,.0f} steps/s, "
           f"{row['real_time_factor']:,.1f} times real time, compiled in {row['compile_s']:.1f} s; "
-          f"controllers {row['controllers_s']:.4f} s a simulated second"
-          + (f"; physics alone {row['physics_steps_per_s']:,.0f} steps/s"
-             if "physics_steps_per_s" in row else ""), flush=True)
+          f"physics alone {row['physics_steps_per_s']:,.0f} steps/s, controllers add "
+          f"{100 * row['controllers_add']:.0f} %; {row['cpu_s']:.4f} s of CPU a simulated second "
+          f"of a world; memory {row['peak_memory_mb']:,.0f} MB", flush=True)

@@ -50,9 +50,10 @@ class Args:
 def run(args: Args) -> int:
     """Measures; always 0, since to refuse a slope is no failure."""
     _check(args)
-    from moonteam.compilation import enable_cache
+    from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
+    call_at_once()
     from moonteam.physics.slopes import measure
     from moonteam.robots import KINDS
 

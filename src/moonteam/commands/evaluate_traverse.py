@@ -78,9 +78,10 @@ def run(args: Args) -> int:
         raise InputError("--length", f"{args.length:g} m; allowed: 1 to 200")
     if args.video and not args.out:
         raise InputError("--video", "needs a folder to write into: --out DIR")
-    from moonteam.compilation import enable_cache
+    from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
+    call_at_once()
     from moonteam.physics.traverse import summarise
 
     summaries, rows, stills = [], [], []

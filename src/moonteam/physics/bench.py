@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco.batch import Batch
+from jax import Array
 
-from moonteam.physics.backends import Commands, NativeBackend, hold, make_backend
+from moonteam.physics.backends import Backend, Commands, NativeBackend, hold, make_backend
 from moonteam.physics.scene import Placement, Scene, build_scene
 from moonteam.robots import KINDS
-from moonteam.robots.base import CONTROL_PERIOD
+from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind, Telemetry
 from moonteam.terrain.site import make_site
+from moonteam.terrain.surface import Surface
 
 SPREAD = 3.0
 """Distance between robots at the start, m."""
@@ -28,9 +36,9 @@ def three_robots(preset: str, seed: int, samples: int) -> Scene:
                               for i, (name, kind) in enumerate(KINDS.items())])
 
 
-def drive(scene: Scene, batch: int) -> Commands:
-    """Commands that keep every robot moving: 4 m ahead at its own speed."""
-    ahead = jnp.array([[0.0, 4.0]])
+def drive(scene: Scene, batch: int, way: float = 1.0) -> Commands:
+    """Commands that keep every robot moving: 4 m ahead (or behind) at its own speed."""
+    ahead = jnp.array([[0.0, 4.0 * way]])
     return tuple(c._replace(xy=c.xy + ahead, speed=jnp.full(batch, r.kind.speed))
                  for c, r in zip(hold(scene, batch), scene.robots, strict=True))
 
@@ -39,41 +47,84 @@ def measure(scene: Scene, name: str, batch: int, seconds: float, threads: int) -
     """One row: a backend with a number of worlds, run for about `seconds` of wall clock.
 
     Keys: compile_s; steps_per_s of all worlds together, controllers included;
-    real_time_factor, simulated seconds of all worlds a wall second; controllers_s, the
-    controllers' share of one simulated second of one world; for native also
-    physics_steps_per_s, without any controller.
+    physics_steps_per_s without them: of the same run on native, of a run with limp robots on
+    mjx, whose work is the same whatever they do; controllers_add, the time that all else takes
+    as a share of the physics'; real_time_factor, simulated seconds of all worlds a wall second;
+    cpu_s, processor seconds for one simulated second of one world; peak_memory_mb of the
+    process so far.
     """
     backend = make_backend(name, scene, threads=threads)
-    chunk = 25
-    compile_s = backend.compile(batch, chunk)
-    state, commands = backend.reset(batch=batch), drive(scene, batch)
-    state, _ = backend.advance(state, commands, chunk)
-
-    def advance() -> None:
-        nonlocal state
-        state, log = backend.advance(state, commands, chunk)
-        jax.block_until_ready(log)
-
-    rate = repeats_per_second(advance, seconds)
-    per_step = chunk * round(CONTROL_PERIOD / scene.model.opt.timestep) * batch
+    per_chunk = CHUNK * round(CONTROL_PERIOD / scene.model.opt.timestep) * batch
+    compile_s = backend.compile(batch, CHUNK)
+    run = _Run(backend, batch)
+    run.chunk()
+    native = isinstance(backend, NativeBackend)
+    if native:
+        backend.physics_s = 0.0
+    cpu, chunks, taken = time.process_time(), *run.chunks(seconds)
+    cpu = time.process_time() - cpu
+    if native:
+        physics_s = backend.physics_s
+    else:
+        limp = replace(scene, robots=tuple(replace(r, kind=_limp(r.kind)) for r in scene.robots))
+        idle = _Run(make_backend(name, limp), batch)
+        idle.chunk()
+        count, spent = idle.chunks(seconds / 2)
+        physics_s = spent * chunks / count
+    steps, simulated = chunks * per_chunk, chunks * CHUNK * CONTROL_PERIOD * batch
     row = {"backend": name, "worlds": batch, "compile_s": compile_s,
-           "steps_per_s": rate * per_step,
-           "real_time_factor": rate * per_step * scene.model.opt.timestep,
-           "controllers_s": _controllers_alone(scene, batch, seconds / 2),
-           "diverged": int(np.asarray(state.diverged).sum())}
-    if name == "native":
-        row |= {"threads": threads,
-                "physics_steps_per_s": _physics_alone(scene, batch, seconds, threads)}
-    return row
+           "steps_per_s": steps / taken, "physics_steps_per_s": steps / physics_s,
+           "controllers_add": taken / physics_s - 1.0, "real_time_factor": simulated / taken,
+           "cpu_s": cpu / simulated, "diverged": run.diverged(),
+           "peak_memory_mb": peak_memory_mb()}
+    return row | ({"threads": threads} if native else {})
 
 
-def repeats_per_second(call: Callable[[], None], seconds: float) -> float:
-    """How often a call runs in a second, from as many calls as fit (at least two)."""
-    count, begun = 0, time.perf_counter()
-    while count < 2 or time.perf_counter() - begun < seconds:
-        call()
-        count += 1
-    return count / (time.perf_counter() - begun)
+CHUNK = 25
+"""Control steps of one call of a backend."""
+
+LAP = 40
+"""Chunks that the robots go one way before they turn back."""
+
+
+class _Run:
+    """Worlds of a backend that are kept moving."""
+
+    def __init__(self, backend: Backend, batch: int):
+        self._backend, self._count = backend, 0
+        self._state = backend.reset(batch=batch)
+        self._ways = [drive(backend.scene, batch, way) for way in (1.0, -1.0)]
+
+    def chunk(self) -> None:
+        """One call of the backend, finished."""
+        commands = self._ways[self._count // LAP % 2]
+        self._state, log = self._backend.advance(self._state, commands, CHUNK)
+        jax.block_until_ready(log)
+        self._count += 1
+
+    def chunks(self, seconds: float) -> tuple[int, float]:
+        """As many calls as fit (at least two), and the wall seconds they took."""
+        count, begun = 0, time.perf_counter()
+        while count < 2 or time.perf_counter() - begun < seconds:
+            self.chunk()
+            count += 1
+        return count, time.perf_counter() - begun
+
+    def diverged(self) -> int:
+        """Worlds that blew up."""
+        return int(np.asarray(self._state.diverged).sum())
+
+
+def _limp(kind: RobotKind) -> RobotKind:
+    """The robot with a controller that does nothing."""
+    actuators = kind.load().compile().nu
+
+    def control(state: Array, time: Array, qpos: Array, qvel: Array, command: Command,
+                surface: Surface) -> tuple[Array, Array, Telemetry]:
+        del time, qpos, qvel, command, surface
+        return jnp.zeros(actuators), state, Telemetry(jnp.zeros(()), jnp.zeros(()))
+
+    return replace(kind, init=lambda qpos, qvel: jnp.zeros(()), control=control)
 
 
 def device_name() -> str:
@@ -81,22 +132,24 @@ def device_name() -> str:
     return jax.devices()[0].device_kind
 
 
-def _physics_alone(scene: Scene, batch: int, seconds: float, threads: int) -> float:
-    """Steps a second of C MuJoCo with the controls at zero, robots resting on the ground."""
-    worlds = Batch(scene.model, batch, threads)
-    worlds.bind("qpos")[:] = scene.qpos0
-    worlds.step(nstep=50)
-    return repeats_per_second(lambda: worlds.step(nstep=50), seconds) * 50 * batch
+def peak_memory_mb() -> float:
+    """Most memory that this process had so far; on an accelerator, that of the device."""
+    stats = jax.devices()[0].memory_stats() or {}
+    if "peak_bytes_in_use" in stats:
+        return stats["peak_bytes_in_use"] / 1e6
+    # Linux counts in KiB, macOS in bytes.
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def _controllers_alone(scene: Scene, batch: int, seconds: float) -> float:
-    """Wall seconds that the controllers of one world take for one simulated second, when
-    `batch` worlds are called together.
-    """
-    backend = NativeBackend(scene, threads=1)
-    state, commands = backend.reset(batch=batch), drive(scene, batch)
-    arguments = (scene.surface, state.time, state.qpos, state.qvel, state.control, commands)
-    jax.block_until_ready(backend.controllers(*arguments))
-    rate = repeats_per_second(
-        lambda: jax.block_until_ready(backend.controllers(*arguments)), seconds)
-    return 1.0 / (rate * CONTROL_PERIOD * batch)
+def compile_times(backend: str, batch: int, options: Sequence[str]) -> dict[str, Any]:
+    """Seconds to compile in a fresh process, with an empty cache and with the cache filled."""
+    row: dict[str, Any] = {"backend": backend, "worlds": batch}
+    words = [sys.executable, "-m", "moonteam.cli", "bench", "physics", "--json", "--backend",
+             backend, "--worlds", str(batch), "--seconds", "0.01", *options]
+    with tempfile.TemporaryDirectory() as folder:
+        for key in ("cold_s", "cached_s"):
+            done = subprocess.run(words, env=os.environ | {"MOONTEAM_CACHE": folder},
+                                  capture_output=True, text=True, check=True)
+            row[key] = json.loads(done.stdout)["rows"][0]["compile_s"]
+    return row
