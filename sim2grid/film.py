@@ -214,17 +214,22 @@ class Film:
 
     def _target_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int],
                      bottom: int) -> int:
-        """The targets, closer together where they are many; returns where the list ends."""
+        """The targets, closer together and in two columns where they are many; returns where
+        the list ends.
+        """
         x, y = at
-        row = min(20.0, max(10.0, (bottom - y) / max(moment.targets, 1)))
+        columns = 1 if (bottom - y) / max(moment.targets, 1) >= 13 else 2
+        lines = max(1, math.ceil(moment.targets / columns))
+        row = min(20.0, (bottom - y) / lines)
         for j, target in enumerate(self.record.targets[:moment.targets]):
-            color, top = SOLVED if j in moment.solved else OPEN, round(y + j * row)
+            color = SOLVED if j in moment.solved else OPEN
+            left, top = x + j // lines * SIDE // 2, round(y + j % lines * row)
             box = round(0.55 * row)
-            pen.rectangle([x, top + 3, x + box, top + 3 + box], fill=(*NIGHT, 160),
+            pen.rectangle([left, top + 3, left + box, top + 3 + box], fill=(*NIGHT, 160),
                           outline=color, width=3 if row > 15 else 2)
             text = f"{self.record.target_names[j]}  {requirement(target)}"
-            _shadowed(pen, (x + 18, top), text, round(0.66 * row), color)
-        return round(y + moment.targets * row)
+            _shadowed(pen, (left + 18, top), text, max(8, round(0.66 * row)), color)
+        return round(y + lines * row)
 
     def _robot_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int]) -> None:
         x, y = at

@@ -5,6 +5,7 @@ import subprocess
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw
 
 from sim2grid import film as films
 from sim2grid.film import FPS, HEIGHT, WIDTH, Film, playback, write
@@ -76,3 +77,33 @@ def test_hillshade_lights_slopes_that_face_north_west():
     facing = hillshade(0.3 * (x - y), 1.0)[10, 10]
     averted = hillshade(0.3 * (y - x), 1.0)[10, 10]
     assert facing > averted + 50
+
+
+class Plain:
+    """Views without OpenGL: one colour."""
+
+    def main(self, moment, qpos):
+        return np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+
+    def close(self, moment, qpos, robot):
+        return np.full((films.CLOSE[1], films.CLOSE[0], 3), 90, np.uint8)
+
+
+@pytest.mark.parametrize("robots", [1, 3, 8])
+def test_every_robot_has_its_place_in_the_strip_and_every_target_in_the_list(
+        mission, execute, script, robots):
+    kinds = ("drone", "legged", "wheeled")
+    spec = mission([f"r{i} {kinds[i % 3]} A {i} 0" for i in range(robots)],
+                   [f"A OR {i % 8} {1 + i // 8}" for i in range(16)], size=(8, 8), max_steps=1)
+    done = execute(spec, script(" ".join(["up"] * robots)))
+    ground = Ground(np.zeros((33, 33)), 0.25)
+    film = Film(spec, done.record, Frame((8, 8), 1.0), ground, range(0, 7 * robots, 7), "test",
+                views=Plain())
+    picture = film.picture(1.0).astype(int)
+    strip = picture[HEIGHT - films.CLOSE[1]:HEIGHT - 20]
+    framed = (strip == 90).all(axis=(0, 2))  # columns that show nothing but a close view
+    borders = np.count_nonzero(np.diff(framed.astype(int)) == 1)
+    assert borders >= robots, "a close view a robot"
+    pen = ImageDraw.Draw(Image.new("RGB", (WIDTH, HEIGHT)), "RGBA")
+    end = film._target_list(pen, film.moment(1.0), (650, 208), films.FREE[3])
+    assert end <= films.FREE[3], "the list ends above a strip that reaches under it"
