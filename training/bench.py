@@ -76,6 +76,7 @@ def measure(args: Args) -> dict[str, Any]:
     import jax
 
     from moonteam.compilation import enable_cache
+    from moonteam.evaluation.provenance import commit
     from training import account, config, loop, networks, rollout, update
     from training.grid_task import GridTask
 
@@ -124,7 +125,7 @@ def measure(args: Args) -> dict[str, Any]:
         "compiled_bytes": whole["compiled_bytes"], "peak_bytes": peak, "peak_of": peak_of,
         "flops_per_env_step": work, "achieved_gflops": achieved, "matmul_peak_gflops": best,
         "share_of_peak": achieved / best, "repeats": args.repeats,
-        "device": loop.describe_device(), "commit": loop.commit(), "versions": versions()}
+        "device": loop.describe_device(), "commit": commit(), "versions": versions()}
 
 
 def timed(work: Callable[[Any], Any], begin: Callable[[], Any], repeats: int) -> dict[str, Any]:

@@ -39,9 +39,8 @@ class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def flatten(learner: Learner) -> dict[str, np.ndarray]:
-    """Every leaf as a host array, named by its path; keys as their raw words."""
-    raw = learner._replace(key=jax.random.key_data(learner.key))
-    leaves = jax.tree_util.tree_flatten_with_path(raw)[0]
+    """Every leaf as a host array, named by its path; the key already as its raw words."""
+    leaves = jax.tree_util.tree_flatten_with_path(learner)[0]
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
@@ -73,7 +72,10 @@ def checksums(learner: Path) -> dict[str, int]:
 
 
 def save(folder: Path, learner: Learner, about: About) -> Path:
-    """Writes one checkpoint and drops all but the newest few. Raises InputError if it cannot."""
+    """Writes one checkpoint and drops all but the newest few. Raises InputError if it cannot.
+
+    `learner` holds host arrays, its key as raw words.
+    """
     import orbax.checkpoint as ocp  # seconds to import, and only training needs it
 
     place = folder / f"{about.total_updates:08d}"

@@ -48,6 +48,12 @@ class Args:
     """Go on with the run in the folder."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints; a chunk of updates is never cut."""
+    coordinator: str = ""
+    """host:port of process 0, to train on several hosts; each runs this command."""
+    processes: int = 1
+    """Processes that train together."""
+    process: int = 0
+    """Number of this one, from 0; others than 0 write to OUT/process-N."""
     dry_run: bool = False
     """Print the numbers, totals, memory and work, train nothing."""
     json: bool = False
@@ -96,10 +102,14 @@ def run(args: Args | imitate.Args | refine.Args) -> int:
 
 
 def _train(args: Args) -> int:
-    from training import loop
+    from training import loop, sharding
 
     config = args.config
     out = args.out or Path("runs") / f"{config.name}-{config.seed}"
+    sharding.use_all_cores()
+    if args.coordinator:
+        sharding.join(args.coordinator, args.processes, args.process)
+        out = out / f"process-{args.process}" if args.process else out
     run = loop.Run(config, out, args.resume, args.checkpoint_seconds)
     say = sys.stderr if args.json else sys.stdout
     try:

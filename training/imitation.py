@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jax.sharding import Mesh
 
 from moonteam.errors import InputError
 from moonteam.grid import env, scenarios, travel
@@ -28,7 +29,7 @@ from moonteam.grid.types import State
 from moonteam.planners.batch import BatchPlans, solve_batch
 from moonteam.planners.exact import MAX_TARGETS
 from moonteam.policies.entity import Decision, Entities, EntitySpec, decide, look
-from training.sharding import check_divides, everywhere, spread
+from training.sharding import everywhere, mesh_for, spread
 
 TIE_BREAK = 0.05
 """Weight that makespan and moves both keep at either end of the preference."""
@@ -192,9 +193,9 @@ def begin(family: Family, ground: Ground | None, key: Array, count: int) -> Walk
     return Walk(states, place, wish, jnp.where(jnp.arange(count) % 2 == 0, 1.0, 0.05), key)
 
 
-def spread_walk(walk: Walk) -> Walk:
+def spread_walk(mesh: Mesh, walk: Walk) -> Walk:
     """The environments shared out over the devices; the key on each of them."""
-    return Walk(*spread(walk[:-1]), everywhere(walk.key))
+    return Walk(*spread(mesh, walk[:-1]), everywhere(mesh, walk.key))
 
 
 def on_ground(ground: Ground | None, states: State, place: Array | np.ndarray) -> State:
@@ -353,17 +354,18 @@ class Dagger:
         """Makes grounds, environments and fresh parameters from the config's seed."""
         from moonteam.policies import entity
 
-        check_divides("imitation", "num_envs", config.num_envs)
-        check_divides("imitation", "batch_size", config.batch_size)
         self.config = config
+        self.mesh = mesh_for(size // f.shrink for f in config.families
+                             for size in (config.num_envs, config.batch_size))
         self.number = 0
         keys = jax.random.split(jax.random.key(config.seed), len(config.families) + 1)
         params = entity.init(config.spec, keys[0])
         mean = jax.tree.map(jnp.copy, params)
-        self.learner = everywhere(Learner(params, mean, optimiser(config).init(params)))
-        self.grounds = [everywhere(make_ground(f, config.seed + i))
+        self.learner = everywhere(self.mesh, Learner(params, mean, optimiser(config).init(params)))
+        self.grounds = [everywhere(self.mesh, make_ground(f, config.seed + i))
                         for i, f in enumerate(config.families)]
-        self.walks = [spread_walk(begin(f, g, k, config.num_envs // f.shrink)) for f, g, k in
+        self.walks = [spread_walk(self.mesh, begin(f, g, k, config.num_envs // f.shrink))
+                      for f, g, k in
                       zip(config.families, self.grounds, keys[1:], strict=True)]
         self.memories = [Memory(config.capacity // f.shrink) for f in config.families]
 
@@ -388,7 +390,8 @@ class Dagger:
             self.memories[i].add(label(family, ground, self.walks[i]))
             rng = np.random.default_rng([config.seed, self.number, i])
             for _ in range(config.batches):
-                batch = spread(self.memories[i].draw(rng, config.batch_size // family.shrink))
+                rows = self.memories[i].draw(rng, config.batch_size // family.shrink)
+                batch = spread(self.mesh, rows)
                 self.learner, value = learn(config, family, ground, self.learner, batch)
                 losses.append(value)
         self.number += 1

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -23,12 +22,14 @@ import numpy as np
 
 from moonteam import files
 from moonteam.errors import InputError
+from moonteam.evaluation.provenance import commit
 from moonteam.policies.checkpoint import PolicyFile, save_policy
 from training import checkpoints, held_out, networks, record, update
 from training.checkpoints import About
 from training.config import Config, Phase
 from training.grid_task import GridTask
 from training.networks import Networks, Pair
+from training.sharding import anywhere, everywhere, gather, mesh_for, spread
 from training.update import Learner, Report
 
 FINAL_SCENARIOS = 500
@@ -85,8 +86,10 @@ class Run:
     def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0):
         """Raises InputError if the folder holds a run that this one may not go on with."""
         self.config, self.out, self.checkpoint_seconds = config, out, checkpoint_seconds
-        self.commit = commit()  # of the code that is loaded now, whatever is checked out later
+        # Of the code that is loaded now, whatever is checked out later.
+        self.commit = commit() or "unknown"
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
+        self.mesh = mesh_for(p.num_envs // p.num_minibatches for _, p in config.phases)
         self.folder = out / "checkpoints"
         self.position, arrays = self._find(resume)
         self.learner = self._resumed(arrays)
@@ -130,12 +133,17 @@ class Run:
         return update.begin(self.nets, self.task(phase), self.config.hyper(phase),
                             phase.num_envs, key, params)
 
+    def _shared(self, learner: Learner) -> Learner:
+        """Environments shared out over the devices, everything else on each of them."""
+        whole = everywhere(self.mesh, learner._replace(carry=()))
+        return whole._replace(carry=spread(self.mesh, learner.carry))
+
     def _resumed(self, arrays: dict[str, np.ndarray] | None) -> Learner | None:
         if arrays is None:
             return None
         index = self.phase_names.index(self.position.phase)
         like = jax.eval_shape(lambda: self.begin(index, None))
-        return checkpoints.unflatten(arrays, like, self.folder)
+        return self._shared(checkpoints.unflatten(arrays, like, self.folder))
 
     @property
     def phase_names(self) -> list[str]:
@@ -162,16 +170,16 @@ class Run:
                      progress: record.Progress) -> bool:
         name, phase = self.config.phases[index]
         if self.learner is None or name != self.position.phase:
-            params = self.learner.params if self.learner is not None else None
-            self.learner = self.begin(index, params)
+            params = gather(self.learner.params) if self.learner is not None else None
+            self.learner = self._shared(self.begin(index, params))
             self.position.phase, self.position.update = name, 0
         while self.position.update < phase.updates:
             enough = stop_after is not None and self.position.total_updates >= stop_after
-            if stop.asked or enough:
+            if enough or anywhere(stop.asked):
                 return False
             count = min(self.config.chunk_updates, phase.updates - self.position.update)
             progress.show(self._chunk(phase, count))
-            if time.monotonic() - self.last_saved > self.checkpoint_seconds:
+            if anywhere(time.monotonic() - self.last_saved > self.checkpoint_seconds):
                 self.save()
         return True
 
@@ -182,7 +190,7 @@ class Run:
         begun = time.monotonic()
         self.learner, report = update.chunk(self.nets, self.task(phase), config.hyper(phase),
                                             self.learner, count)
-        report = jax.device_get(report)
+        report = gather(report)
         seconds = time.monotonic() - begun
         _check_finite(report, position, self.last_good)
         steps = count * phase.num_envs * config.num_steps
@@ -201,10 +209,10 @@ class Run:
         """Held-out scores, argmax and sampled."""
         assert self.learner is not None
         key = jax.random.key(held_out.HELD_OUT_SEED)
-        scores = {}
+        actor, scores = gather(self.learner.params.actor), {}
         for decode in ("argmax", "sample"):
-            score = held_out.score(self.nets, self.task(phase), self.learner.params.actor, key,
-                                   scenarios, decode == "sample")
+            score = held_out.score(self.nets, self.task(phase), actor, key, scenarios,
+                                   decode == "sample")
             scores[decode] = {k: float(v) for k, v in score._asdict().items()}
         return scores
 
@@ -213,7 +221,8 @@ class Run:
         if self.learner is not None:
             spec = dataclasses.asdict(self.config.spec)
             about = About(**dataclasses.asdict(self.position), files={}, network=spec)
-            self.last_good = checkpoints.save(self.folder, self.learner, about)
+            whole = gather(self.learner._replace(key=jax.random.key_data(self.learner.key)))
+            self.last_good = checkpoints.save(self.folder, whole, about)
         self.last_saved = time.monotonic()
 
     def finish(self) -> dict[str, Any]:
@@ -233,7 +242,7 @@ class Run:
     def write_policy(self, path: Path) -> None:
         """The shipped form: parameters with network, recipe and commit in the header."""
         assert self.learner is not None
-        params = jax.device_get(self.learner.params._asdict())
+        params = gather(self.learner.params)._asdict()
         recipe = dataclasses.asdict(self.config) | {"env_steps": self.position.env_steps}
         save_policy(path, PolicyFile("recurrent", dataclasses.asdict(self.config.spec), params,
                                      recipe, self.commit))
@@ -256,17 +265,6 @@ def _check_finite(report: Report, position: Position, last_good: Path | None) ->
             good = f"the last good checkpoint is {last_good}" if last_good else "none was saved yet"
             raise Diverged(f"training diverged after update {position.total_updates} "
                            f"({position.phase}): a loss is not a number; {good}")
-
-
-def commit() -> str:
-    """The checkout's commit, with a + where files differ from it; empty outside a checkout."""
-    here = Path(__file__).resolve().parent
-    try:
-        done = subprocess.run(["git", "describe", "--always", "--abbrev=12", "--dirty=+"],
-                              cwd=here, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return done.stdout.strip()
 
 
 def describe_device() -> str:

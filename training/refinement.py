@@ -55,7 +55,7 @@ from training.imitation import (
     spread_walk,
     views,
 )
-from training.sharding import everywhere, spread
+from training.sharding import everywhere, mesh_for, spread
 
 Reward = Literal["regret", "paper", "none"]
 
@@ -265,12 +265,15 @@ class Refiner:
     def __init__(self, config: Refinement, params: Any):
         """`params`: of the imitated policy."""
         self.config, self.number = config, 0
+        envs = [config.num_envs // f.shrink for f in config.families]
+        self.mesh = mesh_for([*envs, *(e * config.num_steps // config.minibatches for e in envs)])
         params, mean = jax.tree.map(jnp.array, params), jax.tree.map(jnp.array, params)
-        self.learner = everywhere(Learner(params, mean, optimiser(config).init(params)))
-        self.grounds = [everywhere(make_ground(f, config.seed + i))
+        self.learner = everywhere(self.mesh, Learner(params, mean, optimiser(config).init(params)))
+        self.grounds = [everywhere(self.mesh, make_ground(f, config.seed + i))
                         for i, f in enumerate(config.families)]
         keys = jax.random.split(jax.random.key(config.seed + 1_000_003), len(config.families))
-        self.walks = [spread_walk(begin(f, g, k, config.num_envs // f.shrink)) for f, g, k in
+        self.walks = [spread_walk(self.mesh, begin(f, g, k, config.num_envs // f.shrink))
+                      for f, g, k in
                       zip(config.families, self.grounds, keys, strict=True)]
 
         self.memories: list[Memory] = []  # nothing older than a round is learned from
@@ -297,7 +300,7 @@ class Refiner:
             for _ in range(self.config.epochs):
                 order = rng.permutation(len(batch.advantage)).reshape(-1, size)
                 for index in order:
-                    part = spread(jax.tree.map(lambda x, at=index: x[at], batch))
+                    part = spread(self.mesh, jax.tree.map(lambda x, at=index: x[at], batch))
                     self.learner, report = learn(self.config, family, self.grounds[i],
                                                  self.learner, part)
                     losses.append(report)

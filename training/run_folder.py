@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+from jax.sharding import Mesh
 
 from moonteam import files
 from moonteam.errors import InputError
@@ -45,6 +46,7 @@ class Work(Protocol):
 
     config: Imitation | Refinement
     number: int
+    mesh: Mesh
     learner: Learner
     walks: list[Walk]
     memories: list[Memory]
@@ -172,8 +174,9 @@ def _restore(work: Work, arrays: list[np.ndarray], counts: list[int]) -> None:
     walks = [w._replace(key=jax.random.key_data(w.key)) for w in work.walks]
     fixed, shape = jax.tree.flatten((work.learner, walks))
     learner, walks = jax.tree.unflatten(shape, [jnp.asarray(a) for a in arrays[:len(fixed)]])
-    work.learner = everywhere(learner)
-    work.walks = [spread_walk(w._replace(key=jax.random.wrap_key_data(w.key))) for w in walks]
+    work.learner = everywhere(work.mesh, learner)
+    work.walks = [spread_walk(work.mesh, w._replace(key=jax.random.wrap_key_data(w.key)))
+                  for w in walks]
     rest = arrays[len(fixed):]
     for memory, walk, count in zip(work.memories, work.walks, counts, strict=False):
         sample = Sample(walk.states, walk.place, walk.preference, walk.place)

@@ -1,4 +1,4 @@
-"""Batches spread over all devices, parameters on each of them.
+"""Batches spread over all devices, parameters on each of them; several hosts count as one.
 
 On a CPU every core is made a device of its own: XLA shares out a big matrix product among
 cores, but not the many small operations between, which are most of what a small network costs.
@@ -8,41 +8,92 @@ Legend: E environments, or states of a batch; the leading axis that is spread.
 
 from __future__ import annotations
 
+import math
+import os
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from moonteam.errors import InputError
-from moonteam.planners.batch import cores
+from moonteam.evaluation.provenance import cores
 
 
 def use_all_cores() -> None:
-    """Makes each core a device; without effect once JAX has begun to compute."""
+    """Makes each core a device, unless JAX_NUM_CPU_DEVICES says how many there are to be.
+
+    Without effect once JAX has begun to compute.
+    """
+    if "JAX_NUM_CPU_DEVICES" in os.environ:
+        return
     try:
         jax.config.update("jax_num_cpu_devices", cores())
     except RuntimeError:
         return  # somebody computed before: keep the devices there are
 
 
-def mesh() -> Mesh:
-    """All devices in one row."""
-    return Mesh(np.array(jax.devices()), ("batch",))
+def join(coordinator: str, processes: int, process: int) -> None:
+    """Makes this process one of several that train together, before anything is computed.
+
+    `coordinator` is host:port of process 0. Raises InputError if they do not come together.
+    """
+    if not 0 <= process < processes:
+        raise InputError("--process", f"{process} is not allowed; 0 to {processes - 1}")
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (RuntimeError, ValueError) as error:
+        raise InputError("--coordinator", f"{coordinator}: {str(error).splitlines()[0]}") from None
 
 
-def spread(tree: Any) -> Any:
+def mesh_for(rows: Iterable[int]) -> Mesh:
+    """As many devices, in one row, as can share out each of these numbers of rows evenly.
+
+    Raises InputError if that leaves out devices of another process.
+    """
+    devices = jax.devices()
+    common = math.gcd(*rows)
+    count = max(n for n in range(1, len(devices) + 1) if common % n == 0)
+    if jax.process_count() > 1 and count < len(devices):
+        raise InputError("num_envs", f"environments and minibatches must divide among "
+                         f"{len(devices)} devices; {common} is what all of them divide by")
+    return Mesh(np.array(devices[:count]), ("batch",))
+
+
+def spread(mesh: Mesh, tree: Any) -> Any:
     """The leading axis of every leaf shared out evenly over the devices."""
-    return jax.device_put(tree, NamedSharding(mesh(), PartitionSpec("batch")))
+    return _put(tree, NamedSharding(mesh, PartitionSpec("batch")))
 
 
-def everywhere(tree: Any) -> Any:
+def everywhere(mesh: Mesh, tree: Any) -> Any:
     """Every leaf whole on each device."""
-    return jax.device_put(tree, NamedSharding(mesh(), PartitionSpec()))
+    return _put(tree, NamedSharding(mesh, PartitionSpec()))
 
 
-def check_divides(source: str, key: str, value: int) -> None:
-    """Raises InputError if `value` rows cannot be shared out evenly."""
-    count = len(jax.devices())
-    if value % count:
-        raise InputError(source, f"{value} does not divide among {count} devices", key)
+def _put(tree: Any, sharding: NamedSharding) -> Any:
+    """Places every leaf; devices of other processes take only what comes from the host."""
+    if sharding.is_fully_addressable:
+        return jax.device_put(tree, sharding)
+
+    def place(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(place(jax.random.key_data(leaf)))
+        return jax.device_put(np.asarray(leaf), sharding)
+
+    return jax.tree.map(place, tree)
+
+
+def gather(tree: Any) -> Any:
+    """Host arrays, whole, in every process."""
+    if jax.process_count() == 1:
+        return jax.device_get(tree)
+    return multihost_utils.process_allgather(tree, tiled=True)
+
+
+def anywhere(flag: bool) -> bool:
+    """Whether it holds in any process; all of them must ask."""
+    if jax.process_count() == 1:
+        return flag
+    return bool(np.any(multihost_utils.process_allgather(np.array([flag]))))
