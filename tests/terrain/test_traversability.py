@@ -3,6 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from moonteam.physics import slopes
+from moonteam.physics.traverse import SAMPLE_SECONDS, run_traverses
 from moonteam.robots import KINDS
 from moonteam.terrain.site import Boulder, Site, make_site
 from moonteam.terrain.traversability import (
@@ -57,12 +59,24 @@ def test_a_ledge_is_a_step_too_high():
     assert able[:, 10:].all()
 
 
-def test_steeper_is_slower_and_closed_is_for_ever():
-    times = [travel_times(slope_site(d), (4, 4), 1.0, ["wheeled"])["wheeled"].mean()
-             for d in (0, 8, 14)]
-    assert times[0] == pytest.approx(1.0 / KINDS["wheeled"].speed, rel=1e-3)
-    assert times[0] < times[1] < times[2] < 2.1 * times[0]
-    assert np.isinf(travel_times(slope_site(30), (4, 4), 1.0, ["wheeled"])["wheeled"]).all()
+@pytest.mark.parametrize("kind", ["legged", "wheeled"])
+def test_steeper_is_slower_and_closed_is_for_ever(kind):
+    times = [travel_times(slope_site(d), (4, 4), 1.0, [kind])[kind].mean() for d in (0, 8, 16)]
+    assert times[0] == pytest.approx(1.0 / KINDS[kind].speed, rel=1e-3)
+    assert times[0] < times[1] < times[2] < 1.5 * times[0]
+    assert np.isinf(travel_times(slope_site(30), (4, 4), 1.0, [kind])[kind]).all()
+
+
+@pytest.mark.parametrize(("kind", "degrees"), [("legged", 18), ("wheeled", 15)])
+def test_a_slope_takes_as_long_as_the_map_says(kind, degrees):
+    """The middle 5 m of the plane up, from when the robot enters to when it leaves them."""
+    site = slopes.incline(degrees, False, 0.0, 0)
+    route = slopes.routes("up", 1, np.random.default_rng(0))
+    _, (recording,) = run_traverses(KINDS[kind], site, route, record=[0])
+    x = recording.qpos[:, 0]
+    took = np.count_nonzero((x > -2.5) & (x < 2.5)) * SAMPLE_SECONDS
+    told = travel_times(site, (5, 1), 1.0, [kind])[kind].sum()
+    assert told == pytest.approx(took, rel=0.1)
 
 
 def test_off_the_site_nobody_stands():

@@ -29,13 +29,17 @@ from moonteam.terrain.site import Site
 EVENTS = ("rim", "boulders", "slope")
 STATION = 0.25  # m between the points that a route is judged on
 STRETCH = 2.0  # m over which a slope is taken
-CLIP_SECONDS = {"drone": 16.0, "legged": 12.0, "wheeled": 12.0}  # a drone's: take-off to goal
+RIM = 2.5  # m: a rim is as high as its crest stands over the ground this far before and behind
+CLIP_SECONDS = {"drone": 16.0, "legged": 11.0, "wheeled": 10.0}  # a drone's: take-off to goal
+EVERY = 2  # poses a frame: 12.5 frames a second
 SHADOW_REACH = 7.0  # m around the robot
 DISTANCE = {"drone": 4.2, "legged": 2.6, "wheeled": 2.9}  # m, camera from the robot
-RIM_DISTANCE = 1.7  # times as far, so that the rim is seen as one
-LOWEST, HIGHEST = 14.0, 75.0  # degrees, camera above the horizon
+RIM_DISTANCE = 1.4  # times as far, so that the rim is seen as one
+LOWEST, HIGHEST = 12.0, 75.0  # degrees, camera above the horizon
 VIEWS = (-125.0, -55.0, 55.0, 125.0)  # degrees, from the heading to where the camera looks
+RIM_VIEWS = (-95.0, 95.0)  # from the side, where its profile shows
 CLEAR = 0.25  # m, kept between the line of sight and the ground or a boulder
+FRAME_SECONDS = EVERY * SAMPLE_SECONDS
 FRAMES = 5  # of each film on a contact sheet
 
 Floats = npt.NDArray[np.floating]
@@ -72,10 +76,11 @@ def _events(site: Site, route: Route) -> dict[str, tuple[float, float]]:
     stations = np.linspace(0.0, length, max(9, round(length / STATION) + 1))  # [S] m
     line = start + stations[:, None] / length * way
     heights = np.asarray(site.surface.height(jnp.asarray(line, jnp.float32)), np.float64)
-    before = np.minimum.accumulate(heights)
-    after = np.minimum.accumulate(heights[::-1])[::-1]
-    rim = heights - np.maximum(before, after)
     step = stations[1] - stations[0]
+    apart = max(1, min(round(RIM / step), len(stations) // 2 - 1))
+    rim = np.zeros(len(stations))
+    rim[apart:-apart] = heights[apart:-apart] - np.maximum(heights[:-2 * apart],
+                                                           heights[2 * apart:])
     reach = max(1, min(round(STRETCH / step), len(stations) - 1))
     grade = np.abs(heights[reach:] - heights[:-reach]) / (reach * step)
     near = np.zeros(len(stations))
@@ -104,19 +109,21 @@ def film(recording: Recording, path: Path, *, event: str = "", along: float | No
     scene, route, poses = recording
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     first, last = _clip(recording, along)
-    shown = poses[first:last]
-    distance = DISTANCE[scene.robots[0].kind.name] * (RIM_DISTANCE if event == "rim" else 1.0)
-    markers, cameras = _markers(scene, route), _cameras(scene, shown, distance)
-    speeds, rises = _speeds(poses)[first:last], shown[:, 2] - poses[0, 2]
+    shown = poses[first:last:EVERY]
+    distance, views = DISTANCE[scene.robots[0].kind.name], VIEWS
+    if event == "rim":
+        distance, views = RIM_DISTANCE * distance, RIM_VIEWS
+    markers, cameras = _markers(scene, route), _cameras(scene, shown, distance, views)
+    speeds, rises = _speeds(poses)[first:last:EVERY], shown[:, 2] - poses[0, 2]
     kept = set(np.linspace(0, len(shown) - 1, FRAMES).round().astype(int).tolist())
     stills = []
     drawing = render.Renderer(scene, width, height, shadows=True, shadow_reach=SHADOW_REACH)
     with (drawing as renderer, replacing(path) as temporary,
-          mediapy.VideoWriter(temporary, (height, width), fps=1.0 / SAMPLE_SECONDS,
+          mediapy.VideoWriter(temporary, (height, width), fps=1.0 / FRAME_SECONDS,
                               crf=26) as writer):
         for index, (pose, camera) in enumerate(zip(shown, cameras, strict=True)):
-            words = _words(scene, event, (first + index) * SAMPLE_SECONDS, pose, speeds[index],
-                           rises[index])
+            seconds = first * SAMPLE_SECONDS + index * FRAME_SECONDS
+            words = _words(scene, event, seconds, pose, speeds[index], rises[index])
             picture = renderer.frame(pose, camera, markers, words)
             writer.add_image(picture)
             if index in kept:
@@ -169,16 +176,17 @@ def _markers(scene: Scene, route: Route) -> list[render.Marker]:
     return found + render.post(scene, start + (length + 0.7) * ahead, (0.1, 0.8, 0.3, 1.0))
 
 
-def _cameras(scene: Scene, poses: Floats, distance: float) -> list[mujoco.MjvCamera]:
+def _cameras(scene: Scene, poses: Floats, distance: float, views: Sequence[float] = VIEWS
+             ) -> list[mujoco.MjvCamera]:
     """A camera for each pose [T, nq]: from the side, sun behind it, nothing in the way."""
-    aim = _smooth(poses[:, :3].astype(np.float64), 0.6)
+    aim = _smooth(poses[:, :3].astype(np.float64), 0.6, FRAME_SECONDS)
     if scene.robots[0].kind.name == "drone":
         aim[:, 2] -= 0.5  # its shadow shows how high it is
     way = aim[-1, :2] - aim[0, :2]
     heading = math.degrees(math.atan2(way[1], way[0]))
     sunlight = math.degrees(SUN_AZIMUTH) + 180.0
     best: tuple[float, Floats, float] | None = None
-    for view in VIEWS:
+    for view in views:
         azimuth = heading + view
         needed = _elevation(scene, aim, azimuth, distance)
         # The sun 50 degrees off the line of sight shows relief best.
@@ -200,15 +208,15 @@ def _elevation(scene: Scene, aim: Floats, azimuth: float, distance: float) -> Fl
     rise = tops + CLEAR - aim[:, 2:]  # [T, 9] m over the aim
     steepest = np.degrees(np.arctan2(rise, distance * shares[None, :])).max(axis=1)
     needed = np.clip(steepest, LOWEST, HIGHEST)
-    half = round(1.0 / SAMPLE_SECONDS)
+    half = round(1.0 / FRAME_SECONDS)
     padded = np.pad(needed, half, mode="edge")
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).max(axis=1)
-    return _smooth(highest[:, None], 1.0)[:, 0]
+    return _smooth(highest[:, None], 1.0, FRAME_SECONDS)[:, 0]
 
 
-def _smooth(values: Floats, seconds: float) -> Floats:
-    """Values [T, n], averaged over that long."""
-    half = max(1, round(seconds / 2 / SAMPLE_SECONDS))
+def _smooth(values: Floats, seconds: float, step: float) -> Floats:
+    """Values [T, n], `step` s apart, averaged over that long."""
+    half = max(1, round(seconds / 2 / step))
     padded = np.pad(values, ((half, half), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
     return windows.mean(axis=-1)
@@ -218,7 +226,7 @@ def _speeds(poses: Floats) -> Floats:
     """m/s [T] over half a second."""
     steps = np.linalg.norm(np.diff(poses[:, :3].astype(np.float64), axis=0), axis=1)
     moving = np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(1)
-    return _smooth(moving[:, None], 0.5)[:, 0] / SAMPLE_SECONDS
+    return _smooth(moving[:, None], 0.5, SAMPLE_SECONDS)[:, 0] / SAMPLE_SECONDS
 
 
 def _words(scene: Scene, event: str, seconds: float, pose: Floats, speed: float, rise: float

@@ -86,8 +86,10 @@ def _draw_traversability(site: Site, path: Path, cell_m: float, times: dict[str,
         seconds = times[kind]
         half = [n * cell_m / 2 for n in seconds.shape[::-1]]
         open_share = np.isfinite(seconds).mean()
+        least = float(seconds.min()) if open_share else 1.0
         color = axes.imshow(np.ma.masked_invalid(seconds), cmap="viridis_r", alpha=0.45,
-                            origin="lower", extent=(-half[0], half[0], -half[1], half[1]))
+                            vmin=least, vmax=1.5 * least, origin="lower",
+                            extent=(-half[0], half[0], -half[1], half[1]))
         axes.imshow(np.ma.masked_array(np.ones_like(seconds), np.isfinite(seconds)),
                     cmap="Reds", vmin=0, vmax=1.3, alpha=0.8, origin="lower",
                     extent=(-half[0], half[0], -half[1], half[1]))

@@ -39,6 +39,10 @@ POINT_SPACING = 0.25
 STEPS = {"drone": math.inf, "legged": 0.16, "wheeled": 0.12}
 """Highest step each kind takes, m: half a leg's reach; under a wheel's radius."""
 
+SLOWING = {"drone": 0.0, "legged": 0.3, "wheeled": 0.05}
+"""Share of its speed that each kind loses on the steepest ground it may go; in proportion to the
+slope, from `moonteam evaluate slopes`."""
+
 FLYERS = frozenset({"drone"})
 
 
@@ -50,13 +54,15 @@ class Limits:
     max_slope: float  # rad
     max_step: float  # m
     speed: float  # m/s on the level
+    slowing: float  # share of speed lost on max_slope
     flies: bool
 
 
 def limits_of(kind: str) -> Limits:
     """The limits of a kind of robot, from its model. Raises KeyError for an unknown kind."""
     robot = KINDS[kind]
-    return Limits(robot.footprint, robot.max_slope, STEPS[kind], robot.speed, kind in FLYERS)
+    return Limits(robot.footprint, robot.max_slope, STEPS[kind], robot.speed, SLOWING[kind],
+                  kind in FLYERS)
 
 
 def passable_cells(site: Site, mission: Mission, kinds: Iterable[str]) -> dict[str, BoolMap]:
@@ -132,11 +138,11 @@ def _judge(site: Site, xy: npt.NDArray[np.floating], limits: Limits, slope: Floa
 
 def _cell_seconds(site: Site, points: npt.NDArray[np.float64], cell_m: float, limits: Limits
                   ) -> FloatMap:
-    """Seconds [H, W]: slopes slow a robot, by half at the steepest that it may go."""
+    """Seconds [H, W] from one border to the other; turning and stopping are not in it."""
     slope, step = ground_under(site, points, limits.footprint)
     able = _judge(site, points, limits, slope, step).all(axis=-1)
     slope = slope.mean(axis=-1)
-    slowing = 0.0 if limits.flies else 0.5 * np.minimum(slope / limits.max_slope, 1.0) ** 2
+    slowing = limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
     return np.where(able, cell_m / (limits.speed * (1 - slowing)), np.inf)
 
 
