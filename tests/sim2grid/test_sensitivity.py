@@ -162,8 +162,8 @@ def test_the_usual_setting_is_run_once():
 
 
 def test_the_command_draws_its_curves_and_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sensitivity.SWEEPS, "friction", Sweep("friction", 0.75, (0.75,), 0, 1))
-    monkeypatch.setitem(sensitivity.SWEEPS, "delay", Sweep("delay, s", 0.0, (0.0, 0.4), 0, 1))
+    monkeypatch.setitem(sensitivity.SWEEPS, "friction", Sweep("friction", 0.75, (0.75,)))
+    monkeypatch.setitem(sensitivity.SWEEPS, "delay", Sweep("delay, s", 0.0, (0.0, 0.4)))
     out = tmp_path / "out"
     words = ["evaluate", "sensitivity", "--site", "flat", "--side", "4", "--targets", "1",
              "--count", "1", "--quantity", "friction", "delay", "--json", "--out", str(out)]
