@@ -199,8 +199,9 @@ def test_unknown_decodings_are_refused(text):
 
 
 def test_temperature_and_symmetry_are_part_of_the_decoding():
-    assert parse("sample@0.5").temperature == 0.5
-    assert parse("best-of-16-sym@0.50").name == "best-of-16-sym@0.5"
+    assert parse("sample@0.25").temperature == 0.25
+    assert parse("best-of-16-sym@0.250").name == "best-of-16-sym@0.25"
     assert parse("argmax@1.0") == parse("argmax")
+    assert parse("sample@0.5") == parse("sample")
     assert parse("argmax-sym").watch
     assert parse("argmax-sym").symmetric

@@ -6,10 +6,11 @@ import re
 from dataclasses import dataclass
 
 from moonteam.errors import InputError
+from moonteam.planners.base import SAMPLING
 
 MOST_ROLLOUTS = 4096
 ALLOWED = ("argmax, plain-argmax, sample or best-of-K (such as best-of-16); -sym after it "
-           "averages over symmetries, @T sets the temperature (such as sample@0.5)")
+           "averages over symmetries, @T sets the temperature of drawing (such as sample@0.25)")
 
 _FORM = re.compile(r"(?P<how>argmax|plain-argmax|sample|best-of-(?P<count>[^@]*?))"
                    r"(?P<sym>-sym)?(@(?P<heat>.*))?")
@@ -48,15 +49,14 @@ def parse(text: str) -> Decode:
         how = f"best-of-{rollouts}"
     if how == "plain-argmax" and found["heat"] is not None:
         raise InputError("--decode", f"{text!r}: plain-argmax never draws, it has no temperature")
-    heat = _temperature(text, found["heat"])
-    name = how + (found["sym"] or "") + ("" if heat == 1.0 else f"@{heat:g}")
-    return Decode(name, count is not None or how == "sample", how == "argmax", rollouts,
-                  found["sym"] is not None, heat)
+    sample = count is not None or how == "sample"
+    usual = SAMPLING if sample else 1.0
+    heat = usual if found["heat"] is None else _temperature(text, found["heat"])
+    name = how + (found["sym"] or "") + ("" if heat == usual else f"@{heat:g}")
+    return Decode(name, sample, how == "argmax", rollouts, found["sym"] is not None, heat)
 
 
-def _temperature(text: str, heat: str | None) -> float:
-    if heat is None:
-        return 1.0
+def _temperature(text: str, heat: str) -> float:
     try:
         value = float(heat)
     except ValueError:

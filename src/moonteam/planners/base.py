@@ -17,6 +17,8 @@ from moonteam.scenario import ACTIONS, Scenario
 IntArray = npt.NDArray[np.int32]
 BoolArray = npt.NDArray[np.bool_]
 Objective = Literal["makespan", "moves", "weighted"]
+SAMPLING = 0.5
+"""Temperature at which policies draw actions, the best of those tried for best-of-K."""
 
 
 @dataclass(frozen=True)

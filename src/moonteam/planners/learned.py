@@ -24,7 +24,7 @@ from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
 from moonteam.grid.types import Problem, State
 from moonteam.planners import simulate
-from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
+from moonteam.planners.base import SAMPLING, IntArray, Objective, Plan, Snapshot
 from moonteam.planners.routes import Certificate, infeasible, plan_of_trace
 from moonteam.planners.travel import UNREACHABLE, distance_fields
 from moonteam.policies import checkpoint, entity, recurrent, symmetry
@@ -200,7 +200,8 @@ class LearnedPlanner:
     Args:
       policy: see `Policy.load`; or use `LearnedPlanner.load`.
       decode: take the likeliest action of each agent, or draw one.
-      temperature: logits are divided by it when drawing.
+      temperature: logits are divided by it when drawing; `SAMPLING` if not given, and 1 for the
+        watch.
       watch: argmax can circle for ever. With the watch on, when a joint state (cells and
         solved targets) comes back without a target solved in between, that decision is drawn
         instead, at `temperature` for the first return, twice that for the second and so on.
@@ -213,8 +214,10 @@ class LearnedPlanner:
 
     name = "policy"
 
-    def __init__(self, policy: Policy, decode: Decode = "argmax", temperature: float = 1.0,
-                 watch: bool = True, preference: float = 0.0):
+    def __init__(self, policy: Policy, decode: Decode = "argmax",
+                 temperature: float | None = None, watch: bool = True, preference: float = 0.0):
+        if temperature is None:
+            temperature = SAMPLING if decode == "sample" else 1.0
         if temperature <= 0:
             raise InputError("temperature", f"{temperature} is not allowed; above 0")
         self.policy, self.decode, self.temperature = policy, decode, temperature
@@ -223,7 +226,7 @@ class LearnedPlanner:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], decode: Decode = "argmax",
-             temperature: float = 1.0, watch: bool = True,
+             temperature: float | None = None, watch: bool = True,
              preference: float = 0.0) -> LearnedPlanner:
         """From a policy file. Raises InputError."""
         return cls(Policy.load(path), decode, temperature, watch, preference)
@@ -302,7 +305,7 @@ _PRICES: dict[Objective, tuple[float, float]] = {
 
 
 def plan_best_of(policy: Policy, snapshot: Snapshot, count: int, seed: int = 0,
-                 objective: Objective = "makespan", temperature: float = 1.0,
+                 objective: Objective = "makespan", temperature: float = SAMPLING,
                  preference: float = 0.0) -> Plan:
     """The best of `count` sampled rollouts in the grid env, all in one batched call.
 
