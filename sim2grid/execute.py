@@ -41,7 +41,7 @@ from sim2grid.record import (
     Solve,
 )
 from sim2grid.replan import contributors, unsolvable, with_target, without_cell
-from sim2grid.waypoints import waypoints
+from sim2grid.waypoints import crowds, waypoints, yielding
 
 Mode = Literal["barrier", "async"]
 NOBODY = 1 << 30
@@ -127,6 +127,9 @@ class Execution:
         self._charted = self.snapshot.passable  # without what was learned on the way
         self._places = np.array([np.arange(b.base, b.base + 7) for b in bodies])
         self._points: npt.NDArray | None = None  # waypoints, None: to be laid out again
+        self._goals: list[Cell] = []  # as last laid out
+        self._laid = np.zeros((len(bodies), 2))
+        self._grounded = [not body.flies for body in bodies]
 
     def start(self, qpos: npt.ArrayLike) -> None:
         """Takes the robots' first pose, qpos [nq], and comes to the first decision."""
@@ -157,7 +160,12 @@ class Execution:
         mask = self.snapshot.agent_mask
         goals = [leg.goal_cell if leg is not None and mask[i] else _cell(self.snapshot.cells[i])
                  for i, leg in enumerate(self.legs)]
-        points = waypoints(self.frame, goals, [not body.flies for body in self.bodies])
+        points = waypoints(self.frame, goals, self._grounded, self._xy)
+        for group in crowds(goals, self._grounded):
+            if group in crowds(self._goals, self._grounded) and all(
+                    self._goals[i] == goals[i] for i in group):
+                points[group] = self._laid[group]  # as they stand, they need not change places
+        self._goals, self._laid = goals, points
         for i, leg in enumerate(self.legs):
             if leg is not None and leg.ended is None and mask[i]:
                 leg.waypoint = points[i]
@@ -304,7 +312,22 @@ class Execution:
         """Takes the planner's joint action [R] for `question` and sends the robots."""
         self.question = None
         joint = np.where(self.snapshot.agent_mask, np.asarray(actions, np.int32), np.int32(STAY))
-        self._act(joint, moved(self.snapshot, joint))
+        goals = moved(self.snapshot, joint)
+        self._act(joint, self._without_swaps(goals))
+
+    def _without_swaps(self, goals: IntArray) -> IntArray:
+        """Goal cells [R, 2] where nobody changes places head-on: one of the two waits."""
+        where, bound = list(map(_cell, self.snapshot.cells)), list(map(_cell, goals))
+        for i, leg in enumerate(self.legs):
+            if not self.snapshot.agent_mask[i]:
+                bound[i] = where[i]
+            elif i not in self._free and leg is not None:
+                bound[i] = leg.goal_cell
+                where[i] = leg.from_cell if leg.ended is None else where[i]
+        waits = yielding(bound, where, self._free, self._grounded)
+        goals = goals.copy()
+        goals[waits] = self.snapshot.cells[waits]
+        return goals
 
     def _act(self, actions: IntArray, goals: IntArray) -> None:
         """Sends the robots that are free to their goal cells [R, 2]."""

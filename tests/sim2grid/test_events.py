@@ -144,6 +144,24 @@ def test_the_clock_of_async_is_the_teams(mission, execute, script):
     assert done.limit == 256
 
 
+def test_two_that_would_change_places_pass_each_other_in_one_cell(mission, execute):
+    spec = mission(["a legged A 1 0", "b wheeled B 2 0"], ["A OR 3 0", "B OR 0 0"], size=(4, 1))
+    done = execute(spec, ExactPlanner())
+    legs = [(leg.robot, leg.from_cell, leg.goal_cell) for leg in done.record.legs]
+    assert legs[:4] == [(0, (1, 0), (2, 0)), (1, (2, 0), (2, 0)),
+                        (0, (2, 0), (3, 0)), (1, (2, 0), (1, 0))]
+    assert done.record.success
+    first, second = (leg.waypoint for leg in done.record.legs[:2])
+    assert np.abs(first - second).tolist() == pytest.approx([0.0, 0.6])
+
+
+def test_a_lost_robot_is_not_waited_for(mission, execute, script):
+    spec = mission(["a wheeled A 1 0", "b legged A 2 0"], ["A OR 3 0"], size=(4, 1), max_steps=2,
+                   events=[{"at_decision": 1, "lost": "a"}])
+    done = execute(spec, script("right stay", "stay left"), faults={(0, 0.0): "slow"})
+    assert (1, (1, 0)) in [(leg.robot, leg.goal_cell) for leg in done.record.legs]
+
+
 def test_events_survive_the_way_to_json_and_back(mission):
     spec = mission(["a drone A 0 0"], ["A OR 3 3"], events=[
         {"at_decision": 2, "silent": {"robot": "a", "decisions": 3}},
