@@ -52,7 +52,7 @@ def test_the_camera_looks_over_walls():
 
 
 def test_a_film_and_its_contact_sheet(tmp_path, monkeypatch):
-    monkeypatch.setitem(film.CLIP_SECONDS, "drone", 0.24)
+    monkeypatch.setitem(film.CLIP_SECONDS, "drone", 0.48)
     place, route = site(), Route((0.0, 0.0), (3.0, 0.0), 0.0)
     scene = build_scene(place, [Placement("robot", KINDS["drone"], route.start)])
     poses = np.tile(scene.qpos0, (30, 1))
