@@ -22,7 +22,7 @@ from training.sharding import use_all_cores
 PAPER = (Family(3, 5), Family(3, 6), Family(3, 7))
 
 PRESETS = {
-    "quick": Imitation(families=PAPER, rounds=500, num_envs=256, batches=2),
+    "quick": Imitation(families=PAPER, rounds=900, num_envs=256, batches=2),
     "any_team": Imitation(
         families=(
             *PAPER,

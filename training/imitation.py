@@ -279,7 +279,7 @@ def loss(params: Any, spec: EntitySpec, family: Family, ground: Ground | None,
          batch: Sample) -> Array:
     """Cross entropy of the pointer, and of the moves that lead where the label points."""
     view = views(family, ground, batch.states, batch.place, batch.preference)
-    return imitate_loss(decide(params, spec, view), view, batch.pointer)
+    return imitate_loss(decide(params, spec, view, together=False), view, batch.pointer)
 
 
 def imitate_loss(decision: Decision, view: Entities, pointer: Array | np.ndarray) -> Array:
@@ -341,10 +341,10 @@ class Memory:
 
 
 class Round(NamedTuple):
-    """What a round reports."""
+    """What a round reports; still on the devices, not to keep them waiting."""
 
     number: int
-    loss: float
+    loss: Array
 
 
 class Dagger:
@@ -380,19 +380,25 @@ class Dagger:
         return sum(self.config.num_envs // f.shrink for f in self.config.families)
 
     def round(self) -> Round:
-        """Visits, labels and learns, each family once."""
+        """Visits, labels and learns, each family once.
+
+        The devices are given all walks at once, then one gradient step after the other; they
+        work while the planner labels on the host. So all walks of a round follow the policy as
+        it was when the round began.
+        """
         config = self.config
         losses = []
         for i, family in enumerate(config.families):
-            ground = self.grounds[i]
             self.walks[i] = walk_on(config.spec, family, config.steps_between,
-                                    self.learner.params, ground, self.walks[i])
+                                    self.learner.params, self.grounds[i], self.walks[i])
+        for i, family in enumerate(config.families):
+            ground = self.grounds[i]
             self.memories[i].add(label(family, ground, self.walks[i]))
             rng = np.random.default_rng([config.seed, self.number, i])
             for _ in range(config.batches):
                 rows = self.memories[i].draw(rng, config.batch_size // family.shrink)
-                batch = spread(self.mesh, rows)
-                self.learner, value = learn(config, family, ground, self.learner, batch)
+                self.learner, value = learn(config, family, ground, self.learner,
+                                            spread(self.mesh, rows))
                 losses.append(value)
         self.number += 1
-        return Round(self.number, float(jnp.mean(jnp.stack(losses))))
+        return Round(self.number, jnp.mean(jnp.stack(losses)))

@@ -145,8 +145,8 @@ def collect(spec: EntitySpec, family: Family, steps: int, params: Any, ground: G
 
     def step(walk: Walk, _: None) -> tuple[Walk, tuple]:
         act_key, new_key, key = jax.random.split(walk.key, 3)
-        decision = decide(params, spec, views(family, ground, walk.states, walk.place,
-                                              walk.preference))
+        view = views(family, ground, walk.states, walk.place, walk.preference)
+        decision = decide(params, spec, view, together=False)
         actions = jax.random.categorical(act_key, decision.log_probs)
         whole = on_ground(ground, walk.states, walk.place)
         result = jax.vmap(lambda s, a: env.step(config, s, a))(whole, actions)
@@ -159,7 +159,8 @@ def collect(spec: EntitySpec, family: Family, steps: int, params: Any, ground: G
         return renew(family, ground, new_key, after, ended), row
 
     walk, rows = jax.lax.scan(step, walk, None, steps)
-    last = decide(params, spec, views(family, ground, walk.states, walk.place, walk.preference))
+    view = views(family, ground, walk.states, walk.place, walk.preference)
+    last = decide(params, spec, view, together=False)
     final = (walk.states, walk.place, walk.preference, last.value)
     longer = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), rows[:4], final)
     return walk, Collected(*longer, *rows[4:])
@@ -219,7 +220,7 @@ def loss(params: Any, config: Refinement, family: Family, ground: Ground | None,
     """Clipped PPO of every agent with the team's advantage, critic, entropy, leash."""
     sample = batch.sample
     view = views(family, ground, sample.states, sample.place, sample.preference)
-    decision = decide(params, config.spec, view)
+    decision = decide(params, config.spec, view, together=False)
     ratio = jnp.exp(taken(decision.log_probs, batch.action) - batch.log_prob)
     real = view.agent_mask * batch.weight[:, None]
     count = jnp.maximum(jnp.sum(real), 1.0)

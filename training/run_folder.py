@@ -35,9 +35,8 @@ EVAL_EVERY = 100
 class Round(Protocol):
     """What a round reports."""
 
-    @property
-    def loss(self) -> float:
-        """Of its last gradient steps, in the mean."""
+    def _asdict(self) -> dict[str, Any]:
+        """Figures by name, some still on the devices."""
         ...
 
 
@@ -117,7 +116,7 @@ class Run:
     def _record(self, report: Round | None) -> None:
         work = self.work
         row = {"round": work.number, "seconds": self.seconds,
-               **(report._asdict() if report else {}),
+               **({k: float(v) for k, v in report._asdict().items()} if report else {}),
                "labelled": work.number * work.states_a_round,
                "families": [family_row(f, h, work.config.spec, work.learner.mean)
                             for f, h in zip(work.config.families, self.held_out, strict=True)]}

@@ -11,7 +11,8 @@ import pytest
 from moonteam.grid import env, scenarios
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.travel import problem_fields
-from moonteam.policies.entity import STAY, EntitySpec, decide, init, look, usable
+from moonteam.grid.types import Problem, State
+from moonteam.policies.entity import STAY, EntitySpec, agree, decide, init, look, usable
 
 SPEC = EntitySpec(width=16, heads=2, layers=2)
 
@@ -114,3 +115,29 @@ def test_open_map_read_by_fields_is_the_same_map():
     walled = replace(state, problem=replace(state.problem, passable=free))
     by_fields = act(walled, fields=problem_fields(walled.problem))
     np.testing.assert_allclose(by_fields.log_probs, act(state).log_probs, atol=1e-4)
+
+
+def claims(pointer, skills, target_skills, both):
+    """`agree` for a team at one place before targets side by side."""
+    agents, targets = len(skills), len(target_skills)
+    problem = Problem(
+        size=jnp.array([8, 8]), agent_skills=jnp.array(skills),
+        agent_kinds=jnp.zeros(agents, jnp.int32), agent_mask=jnp.ones(agents, bool),
+        target_cells=jnp.array([[x, 5] for x in range(targets)]),
+        target_skills=jnp.array(target_skills), target_and=jnp.array(both),
+        target_mask=jnp.ones(targets, bool))
+    state = State(problem, jnp.zeros((agents, 2), jnp.int32), jnp.zeros(targets, bool),
+                  jnp.zeros((), jnp.int32))
+    view = look(state, 128, jnp.zeros(()))
+    got = agree(jnp.array(pointer, jnp.float32), view)
+    return np.asarray(jnp.argmax(got, axis=-1))
+
+
+def test_the_surest_takes_an_or_target_and_the_others_the_next():
+    logits = [[5.0, 1.0, 0.0], [9.0, 1.0, 0.0], [4.0, 0.0, 2.0]]
+    np.testing.assert_array_equal(claims(logits, [1, 1, 1], [1, 1], [False, False]), [1, 0, 2])
+
+
+def test_an_and_target_is_open_to_whoever_brings_what_is_missing():
+    logits = [[9.0, 1.0, 0.0], [8.0, 1.0, 0.0], [7.0, 1.0, 0.0]]
+    np.testing.assert_array_equal(claims(logits, [1, 1, 2], [3, 3], [True, False]), [0, 1, 0])

@@ -57,7 +57,7 @@ def test_memory_is_a_ring():
 
 def test_learning_lowers_the_loss():
     dagger = Dagger(TINY)
-    losses = [dagger.round().loss for _ in range(30)]
+    losses = [float(dagger.round().loss) for _ in range(30)]
     assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
 
 

@@ -174,6 +174,7 @@ class Entity(nn.Module):
     """Entities -> pointer logits, action log-probabilities and the team's value."""
 
     spec: EntitySpec = EntitySpec()
+    together: bool = True  # actions respect the claims of `agree`; the pointer stays as it is
 
     @nn.compact
     def __call__(self, view: Entities) -> Decision:
@@ -192,7 +193,8 @@ class Entity(nn.Module):
             x = Block(spec, name=f"block{layer}")(x, part, mask)
         x = nn.LayerNorm(name="last")(x)
         pointer, free = self._point(x, pairs, view, n)
-        return Decision(pointer, mix(pointer, free, view, spec.free), self._value(x, mask))
+        acting = agree(pointer, view) if self.together else pointer
+        return Decision(pointer, mix(acting, free, view, spec.free), self._value(x, mask))
 
     def _by_role(self, pairs: Array, n: int, outputs: int, name: str) -> Array:
         """[B, E, E, outputs] linear readings of the pair features, one for each role pair."""
@@ -222,9 +224,43 @@ class Entity(nn.Module):
         return nn.Dense(1, name="value")(pooled)[..., 0]
 
 
-def decide(params: Any, spec: EntitySpec, view: Entities) -> Decision:
-    """The network's word on a batch of moments; `params` as from `init`."""
-    return cast(Decision, Entity(spec).apply({"params": params}, view))
+def decide(params: Any, spec: EntitySpec, view: Entities, together: bool = True) -> Decision:
+    """The network's word on a batch of moments; `params` as from `init`.
+
+    `together`: actions are those left when claims are settled, see `agree`.
+    """
+    return cast(Decision, Entity(spec, together).apply({"params": params}, view))
+
+
+def agree(pointer: Array, view: Entities) -> Array:
+    """Pointer logits [B, N, M + 1] without the targets that others have claimed.
+
+    The network decides for all agents at once, so two of them may set out for a target that
+    needs one. Everybody knows everybody's logits; so the surest agent takes its first choice,
+    then the surest of the others among what is left, and so on. An OR target is closed once
+    claimed; an AND target to agents that bring none of the skills still missing there.
+    """
+    agents = pointer.shape[-2]
+    everyone = jnp.arange(agents)
+
+    def claim(at: tuple[Array, Array, Array], _: None) -> tuple[tuple, None]:
+        logits, missing, waiting = at
+        sure = jnp.max(jax.nn.log_softmax(logits, axis=-1), axis=-1)  # [..., N]
+        turn = jnp.argmax(jnp.where(waiting, sure, -2.0 * FAR), axis=-1)
+        mine = everyone == turn[..., None]  # [..., N]
+        row = jnp.sum(jnp.where(mine[..., None], logits, 0.0), axis=-2)
+        choice = jax.nn.one_hot(jnp.argmax(row, axis=-1), row.shape[-1], dtype=bool)[..., :-1]
+        skills = jnp.sum(jnp.where(mine, view.agent_skills, 0), axis=-1)
+        left = jnp.where(view.target_and, missing & ~skills[..., None], 0)
+        missing = jnp.where(choice, left, missing)  # [..., M]
+        waiting = waiting & ~mine
+        shut = (view.agent_skills[..., :, None] & missing[..., None, :]) == 0  # [..., N, M]
+        shut = shut & waiting[..., None]
+        closed = jnp.where(shut, -FAR, logits[..., :-1])
+        return (jnp.concatenate([closed, logits[..., -1:]], axis=-1), missing, waiting), None
+
+    start = (pointer, view.target_skills, view.agent_mask)
+    return jax.lax.scan(claim, start, None, agents)[0][0]
 
 
 def init(spec: EntitySpec, key: Array) -> Any:
