@@ -20,6 +20,8 @@ COMMANDS = {
     "replay": ("moonteam.commands.replay", "the grid env's trace of a list of actions"),
     "rollout": ("sim2grid.command", "run a mission in physics: video and report"),
     "evaluate grid": ("moonteam.commands.evaluate_grid", "planners side by side on a set"),
+    "evaluate sets": (
+        "moonteam.commands.evaluate_sets", "one policy over all bundled sets, one row a set"),
     "evaluate replanning": (
         "moonteam.commands.evaluate_replanning", "5 + 5 targets, new ones while under way"),
     "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),
@@ -38,6 +40,7 @@ COMMANDS = {
     "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
     "bench train": ("training.bench", "training throughput"),
     "bench physics": ("moonteam.commands.bench_physics", "physics steps per second"),
+    "bench execution": ("sim2grid.bench_command", "missions in physics per second"),
     "testsets": ("moonteam.commands.testsets", "make the scenario sets, with their optima"),
     "doctor": ("moonteam.commands.doctor", "what this machine can do"),
 }
