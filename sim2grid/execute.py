@@ -161,10 +161,12 @@ class Execution:
         goals = [leg.goal_cell if leg is not None and mask[i] else _cell(self.snapshot.cells[i])
                  for i, leg in enumerate(self.legs)]
         points = waypoints(self.frame, goals, self._grounded, self._xy)
-        for group in crowds(goals, self._grounded):
-            if group in crowds(self._goals, self._grounded) and all(
-                    self._goals[i] == goals[i] for i in group):
-                points[group] = self._laid[group]  # as they stand, they need not change places
+        shared, before = crowds(goals, self._grounded), crowds(self._goals, self._grounded)
+        alone = [[i] for i, leg in enumerate(self.legs) if leg is not None and not leg.moving
+                 and not any(i in group for group in shared)]
+        for group in [group for group in shared if group in before] + alone:
+            if self._goals and all(self._goals[i] == goals[i] for i in group):
+                points[group] = self._laid[group]  # who stays need not change places
         self._goals, self._laid = goals, points
         for i, leg in enumerate(self.legs):
             if leg is not None and leg.ended is None and mask[i]:

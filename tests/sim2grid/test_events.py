@@ -155,6 +155,15 @@ def test_two_that_would_change_places_pass_each_other_in_one_cell(mission, execu
     assert np.abs(first - second).tolist() == pytest.approx([0.0, 0.6])
 
 
+def test_who_stays_behind_keeps_its_side(mission, execute, script):
+    spec = mission(["a legged A 1 0", "b wheeled B 2 0"], ["A OR 3 0", "B OR 0 3"], max_steps=3)
+    done = execute(spec, script("right stay", "right stay", "stay stay"))
+    first, last = (leg.waypoint for leg in done.record.legs if leg.robot == 1 and
+                   leg.decision in (0, 2))
+    np.testing.assert_allclose(last, first)
+    assert np.abs(first - done.frame.centre(np.array([2.0, 0.0]))).max() == pytest.approx(0.3)
+
+
 def test_a_lost_robot_is_not_waited_for(mission, execute, script):
     spec = mission(["a wheeled A 1 0", "b legged A 2 0"], ["A OR 3 0"], size=(4, 1), max_steps=2,
                    events=[{"at_decision": 1, "lost": "a"}])
