@@ -114,6 +114,7 @@ class Evaluation:
     seed: int = 0
     width: int = 25  # B
     backend: str = "native"
+    threads: int = 0  # of the native engine, 0 for all CPUs
     keep: Callable[[Row], None] = lambda row: None
     progress: Callable[[str, int, int], None] = lambda title, done, total: None
     rows: dict[tuple[str, int], Row] = field(default_factory=dict)
@@ -184,7 +185,8 @@ class Group:
         if self._engine is None:
             from moonteam.physics.backends import make_backend
 
-            self._engine = make_backend(self._all.backend, self._fleet.scene)
+            self._engine = make_backend(
+                self._all.backend, self._fleet.scene, threads=self._all.threads)
         return self._engine
 
     def _execution(self, contender: Contender, make: Callable[[], Planner], k: int,

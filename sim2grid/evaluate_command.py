@@ -82,6 +82,8 @@ class Args:
     """Physics engine: C MuJoCo, or MJX for accelerators."""
     width: int = 25
     """Worlds that the engine advances together."""
+    threads: int = 0
+    """CPU threads of the native engine, 0 for all; the report is the same."""
     resume: bool = False
     """Go on with the run in --out; the options must be the same."""
     json: bool = False
@@ -134,9 +136,9 @@ def _check(args: Args) -> None:
             ("count", args.count, 1, 100_000), ("targets", args.targets, 1, 64),
             ("side", args.side, 4, 128), ("max-steps", args.max_steps, 1, 100_000),
             ("seed", args.seed, 0, 2**31), ("site-seed", args.site_seed, 0, 2**31),
-            ("width", args.width, 1, 4096), ("new-targets", args.new_targets, 0, 64),
-            ("cell", args.cell, 0.25, 10), ("lose", args.lose, 0, 1), ("slow", args.slow, 0, 1),
-            ("silent", args.silent, 0, 1)):
+            ("width", args.width, 1, 4096), ("threads", args.threads, 0, 1024),
+            ("new-targets", args.new_targets, 0, 64), ("cell", args.cell, 0.25, 10),
+            ("lose", args.lose, 0, 1), ("slow", args.slow, 0, 1), ("silent", args.silent, 0, 1)):
         if not low <= value <= high:
             raise InputError(f"--{name}", f"{value} is not allowed; {low} to {high}")
     if args.resume and args.out is None:
@@ -158,7 +160,7 @@ def _evaluation(args: Args) -> Evaluation:
                      args.decode if name == "policy" else "argmax", args.objective)
            for name in args.planner]
     return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who), args.seed,
-                      args.width, args.backend, progress=_progress())
+                      args.width, args.backend, args.threads, progress=_progress())
 
 
 def _progress() -> Any:
@@ -176,7 +178,8 @@ def _progress() -> Any:
 
 def _options(args: Args) -> dict[str, Any]:
     """What the rows depend on; the same in a run and in what resumes it."""
-    left_out = ("json", "markdown", "out", "resume", "lose", "slow", "silent", "new_targets")
+    left_out = ("json", "markdown", "out", "resume", "threads", "lose", "slow", "silent",
+                "new_targets")
     options = {key: value for key, value in asdict(args).items() if key not in left_out}
     rates = {"lose": args.lose, "slow": args.slow, "silent": args.silent,
              "new_targets": args.new_targets}
@@ -187,7 +190,7 @@ def _command(args: Args) -> str:
     """The command that makes this report again; options at their default are left out."""
     words = ["moonteam", "evaluate", "execution"]
     for key, value in asdict(args).items():
-        if key in ("json", "markdown", "out", "resume") or value == getattr(Args, key):
+        if key in ("json", "markdown", "out", "resume", "threads") or value == getattr(Args, key):
             continue
         words += [f"--{key.replace('_', '-')}",
                   *(map(str, value) if isinstance(value, tuple) else [str(value)])]
