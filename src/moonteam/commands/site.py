@@ -136,7 +136,7 @@ def _write(site: Site, out: Path, cell_m: float, seconds: Maps) -> list[str]:
     arrays = {f"open_{kind}": np.isfinite(cells) for kind, cells in seconds.items()}
     arrays |= {f"seconds_{kind}": cells.astype(np.float32) for kind, cells in seconds.items()}
     with files.replacing(out / "maps.npz") as temporary:
-        np.savez_compressed(temporary, **arrays)
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
     with files.replacing(out / "heights.npy") as temporary:
         # North first, so that the file can be imported again.
         np.save(temporary, site.heights[::-1])

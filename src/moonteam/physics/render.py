@@ -104,12 +104,11 @@ class Renderer:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)  # lights and cameras need it
         mujoco.mj_camlight(self._model, self._data)
-        if camera is None:
-            camera = overview(self.scene, qpos, aspect=self.width / self.height)
+        seen = camera or overview(self.scene, qpos, aspect=self.width / self.height)
         if self._follow_shadow:
             sun = self._data.light_xdir[0]
-            self._data.light_xpos[0] = np.asarray(camera.lookat) - look.SUN_DISTANCE * sun
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, camera,
+            self._data.light_xpos[0] = np.asarray(seen.lookat) - look.SUN_DISTANCE * sun
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, seen,
                                mujoco.mjtCatBit.mjCAT_ALL, self._drawn)
         for marker in markers:
             self._draw(marker)
