@@ -51,7 +51,7 @@ SIDE = 190  # of the map beside 3-D pictures
 CLOSE = (168, 112)  # largest size of a robot's close view
 AT_REST = 0.12  # m/s
 NEWS_S = 1.6  # film seconds for which the cause of a new plan is told
-FREE = (MARGIN, 6 * MARGIN, WIDTH - SIDE - 3 * MARGIN, HEIGHT - CLOSE[1] - 2 * MARGIN)
+FREE = (MARGIN, 9 * MARGIN, WIDTH - SIDE - 3 * MARGIN, HEIGHT - CLOSE[1] - 2 * MARGIN)
 """Left, top, right, bottom of what no map, list or close view covers."""
 
 
