@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
@@ -148,8 +147,8 @@ class _Rows:
         nothing = (np.zeros(2), 0.0, True)
         robots = len(next(rows for rows in asked if rows is not None))
         table = [[nothing] * robots if rows is None else rows for rows in asked]
-        return tuple(
-            Command(xy=jnp.asarray(np.stack([row[i][0] for row in table]), jnp.float32),
-                    speed=jnp.asarray([row[i][1] for row in table], jnp.float32),
-                    lost=jnp.asarray([row[i][2] for row in table]))
-            for i in range(robots))
+        def column(robot: int, part: int, kind: type) -> Any:
+            return np.array([row[robot][part] for row in table], kind)
+
+        return tuple(Command(column(i, 0, np.float32), column(i, 1, np.float32),
+                             column(i, 2, bool)) for i in range(robots))

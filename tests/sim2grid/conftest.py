@@ -128,7 +128,7 @@ def run_on_points(spec, planner, *, faults=None, passable=None, speed=0.5, traps
     return execution
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def mission():
     return make_mission
 

@@ -161,6 +161,7 @@ def _check_steps(num_control_steps: int, log_every: int) -> None:
 class MjxBackend:
     """MuJoCo MJX. Model and ground are arguments of the compiled function, not constants in
     it, so sites of one size share a compilation, within a process and in JAX's cache on disk.
+    `model` is the scene's, as MJX has it.
     """
 
     name = "mjx"
@@ -170,7 +171,7 @@ class MjxBackend:
         self.log_every = log_every
         self._substeps = _substeps(scene)
         with jax.numpy_rank_promotion("allow"):
-            self._model = mjx.put_model(scene.model)
+            self.model = mjx.put_model(scene.model)
             self._blank = mjx.make_data(scene.model)
         self._programs: dict[tuple[int, int], jax.stages.Compiled] = {}
         self._reset = jax.jit(jax.vmap(
@@ -187,7 +188,7 @@ class MjxBackend:
         key = self._key(state.qpos.shape[0], num_control_steps)
         if key not in self._programs:
             self.compile(*key)
-        return self._programs[key](self._model, self.scene.surface, _strong(state),
+        return self._programs[key](self.model, self.scene.surface, _strong(state),
                                    _strong(commands))
 
     def compile(self, batch: int, num_control_steps: int) -> float:
@@ -195,18 +196,19 @@ class MjxBackend:
         key = self._key(batch, num_control_steps)
         state, commands = self.reset(batch=batch), hold(self.scene, batch)
         begun = time.perf_counter()
-        advance = jax.jit(self._advance_worlds, static_argnames="num_samples")
+        advance = jax.jit(self.traced, static_argnames="num_control_steps")
         self._programs[key] = advance.lower(
-            self._model, self.scene.surface, state, commands,
-            num_samples=num_control_steps // self.log_every).compile()
+            self.model, self.scene.surface, state, commands,
+            num_control_steps=num_control_steps).compile()
         return time.perf_counter() - begun
 
     def _key(self, batch: int, num_control_steps: int) -> tuple[int, int]:
         _check_steps(num_control_steps, self.log_every)
         return batch, num_control_steps
 
-    def _advance_worlds(self, model: mjx.Model, surface: Surface, state: WorldState,
-                        commands: Commands, num_samples: int) -> tuple[WorldState, Log]:
+    def traced(self, model: mjx.Model, surface: Surface, state: WorldState,
+               commands: Commands, num_control_steps: int) -> tuple[WorldState, Log]:
+        """`advance` as a pure function of model and ground, to be part of a larger program."""
         def sample(worlds: WorldState, _: None) -> tuple[WorldState, Log]:
             def step(carry: WorldState, _: None) -> tuple[WorldState, tuple[Array, Array]]:
                 return jax.vmap(self._control_step, in_axes=(None, None, 0, 0))(
@@ -216,7 +218,8 @@ class MjxBackend:
                 step, worlds, None, length=self.log_every)
             return worlds, Log(worlds.qpos, power.mean(axis=0), propellant.mean(axis=0))
 
-        state, log = jax.lax.scan(sample, state, None, length=num_samples)
+        state, log = jax.lax.scan(
+            sample, state, None, length=num_control_steps // self.log_every)
         return _strong(state), jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), log)
 
     def _control_step(self, model: mjx.Model, surface: Surface, world: WorldState,
