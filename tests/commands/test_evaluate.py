@@ -85,6 +85,25 @@ def test_exact_is_optimal_in_both_objectives_and_greedy_never_better(capsys, tmp
     assert without_times(output(capsys, *words)) == without_times(document)
 
 
+def test_policies_on_sets_one_row_each(capsys, policy, tmp_path):
+    lines = [line for line in GOLDEN.read_text().splitlines() if '"3r5t' in line][:3]
+    for name in ("first", "second"):
+        (tmp_path / f"{name}.jsonl").write_text("\n".join(lines))
+    words = ["evaluate", "sets", str(tmp_path / "first.jsonl"), str(tmp_path / "second.jsonl"),
+             "--policy", policy, "--best-of", "2", "--limit", "2"]
+    document = output(capsys, *words, "--json", "--out", str(tmp_path / "run"))
+    assert [row["planner"] for row in document["summary"]] == ["first", "second"]
+    for row in document["summary"]:
+        assert row["scenarios"] == 2
+        assert {"success", "makespan_gap_best", "tte_ratio_effort"} <= row.keys()
+        assert row["makespan_gap_best"] <= row["makespan_gap"] + 5.0
+    first, second = document["summary"]
+    assert first["success"] == second["success"]
+    assert main([*words, "--markdown"]) == 0
+    assert "| set | success |" in capsys.readouterr().out
+    assert main(["evaluate", "sets", "nowhere", "--policy", policy]) == 2
+
+
 def test_policies_stand_beside_planners(capsys, policy, tmp_path):
     lines = [line for line in GOLDEN.read_text().splitlines() if '"3r5t' in line][:4]
     small = tmp_path / "small.jsonl"

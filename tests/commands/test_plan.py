@@ -109,7 +109,9 @@ def test_bundled_missions_and_sets_are_found(capsys):
     (["SET:0", "--time-limit", "0"], "--time-limit: 0.0 is not allowed"),
     (["SET:0", "--seed", "-1"], "--seed: -1 is not allowed"),
     (["SET:0", "--objective", "weighted", "--beta", "-1"], "are not allowed"),
-    (["SET:0", "--planner", "policy"], "needs --policy FILE"),
+    (["SET:0", "--planner", "policy", "--policy", "none"], "none"),
+    (["SET:0", "--planner", "policy", "--preference", "2"], "--preference: 2.0 is not allowed"),
+    (["SET:0", "--planner", "policy", "--decode", "best-of-x"], "--decode"),
 ])
 def test_bad_input_is_one_line_and_exit_code_two(capsys, scenario_set, tmp_path, words, message):
     words = [w.replace("SET", str(scenario_set)) for w in words]

@@ -17,7 +17,7 @@ Many = tyro.conf.UseAppendAction
 
 @dataclass(frozen=True)
 class Args:
-    """Play the bundled scenario sets with one policy, whatever their teams and targets.
+    """Play the bundled scenario sets with a policy, whatever their teams and targets.
 
     Columns: decided step by step (argmax with the deadlock watch) at preference 0 and at
     preference 1, and the best of K sampled rollouts at preference 0. Gaps are mean makespan and
@@ -30,8 +30,9 @@ class Args:
 
     sets: tyro.conf.Positional[tuple[str, ...]] = ()
     """Bundled sets or files (.jsonl); all bundled ones if not given."""
-    policy: str = "any_team"
-    """Policy file (.safetensors) or the name of a bundled policy."""
+    policy: Many[tuple[str, ...]] = ()
+    """Policy file (.safetensors) or the name of a bundled policy; again for more. Default:
+    any_team."""
     best_of: int = 16
     """K, sampled rollouts a scenario."""
     limit: int | None = None
@@ -51,18 +52,19 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import provenance, report
 
-    path = paths.find(args.policy, "policies", ".safetensors")
-    rows, left = [], list(args.sets or _bundled())
+    found = [paths.find(name, "policies", ".safetensors") for name in args.policy or ("any_team",)]
+    rows, left = [], [(name, path) for name in args.sets or _bundled() for path in found]
     try:
         while left:
-            rows.append(_row(left[0], path, args))
+            rows.append(_row(*left[0], args))
             del left[0]
     except KeyboardInterrupt:
-        print(f"moonteam: interrupted; the report lacks {', '.join(left)}", file=sys.stderr)
-    words = [*args.sets, "--policy", args.policy]
+        lacking = ", ".join(name for name, _ in left)
+        print(f"moonteam: interrupted; the report lacks {lacking}", file=sys.stderr)
+    words = [*args.sets, *(word for name in args.policy for word in ("--policy", name))]
     words += ["--limit", str(args.limit)] if args.limit else []
     document = {
-        "title": f"policy {path.stem}", "summary": rows, "rows": [],
+        "title": "policies on sets", "summary": rows, "rows": [], "rows_are": "set",
         "notes": [f"argmax: with the deadlock watch; best-of-{args.best_of}: planning time is the "
                   "whole set's, played in batches, over its scenarios.",
                   "5x20 and 8x40 are held against the best known plans, the others against "
@@ -95,7 +97,10 @@ def _row(name: str, policy: Path, args: Args) -> dict:
     asked = SimpleNamespace(planner=("policy",), objective=(), policy=(str(policy),),
                             time_limit=None, seed=args.seed)
     found = load_set(name, args.limit)
-    row: dict = {"planner": Path(name).stem, "scenarios": len(found), "intervals": {}}
+    label = Path(name).stem
+    if len(args.policy) > 1:
+        label += f", {policy.parent.name if policy.stem == 'policy' else policy.stem}"
+    row: dict = {"planner": label, "scenarios": len(found), "intervals": {}}
     for suffix, wish, decode in (("", 0.0, "argmax"), ("_effort", 1.0, "argmax"),
                                  ("_best", 0.0, f"best-of-{args.best_of}")):
         asked.preference, asked.decode = (wish,), (decode,)

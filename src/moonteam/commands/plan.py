@@ -30,7 +30,7 @@ class Args:
       moonteam plan 3x7:12 --planner exact --out runs/plan
       moonteam plan assets/testsets/8x40.jsonl:3 --planner lns --time-limit 10
       moonteam plan outpost --objective weighted --alpha 1 --beta 0.05 --json
-      moonteam plan demo --planner policy --policy small
+      moonteam plan outpost --planner policy --decode best-of-16
     """
 
     scenario: tyro.conf.Positional[str]
@@ -46,8 +46,12 @@ class Args:
     """Weight of the moves in the objective weighted."""
     time_limit: float | None = None
     """Seconds after which exact, lns and cpsat return the best plan they have."""
-    policy: str | None = None
+    policy: str = "any_team"
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
+    decode: str = "argmax"
+    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
+    preference: float = 0.0
+    """0 (time) to 1 (effort), for a policy that takes one."""
     seed: int = 0
     """Seed of lns and of a policy that samples."""
     json: bool = False
@@ -138,15 +142,20 @@ def make_plan(args: Args, snapshot: Snapshot) -> Plan:
 
 
 def _policy_plan(args: Args, snapshot: Snapshot) -> Plan:
-    if args.policy is None:
-        raise InputError("--planner policy", "needs --policy FILE")
     from moonteam import compilation
-    from moonteam.planners.learned import LearnedPlanner
+    from moonteam.evaluation import decode as decoding
+    from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
     from moonteam.planners.rollout import plan_from_planner
 
+    how = decoding.parse(args.decode)
     compilation.enable_cache()
-    path = paths.find(args.policy, "policies", ".safetensors")
-    return plan_from_planner(LearnedPlanner.load(path), snapshot, args.objective, args.seed)
+    policy = Policy.load(paths.find(args.policy, "policies", ".safetensors"))
+    if how.rollouts > 1:
+        return plan_best_of(policy, snapshot, how.rollouts, args.seed, args.objective,
+                            how.temperature, args.preference)
+    planner = LearnedPlanner(policy, "sample" if how.sample else "argmax", how.temperature,
+                             how.watch, args.preference)
+    return plan_from_planner(planner, snapshot, args.objective, args.seed)
 
 
 def check(args: Args) -> None:
@@ -156,6 +165,9 @@ def check(args: Args) -> None:
         raise InputError("--time-limit", f"{limit} is not allowed; seconds above 0")
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
+    if not 0.0 <= args.preference <= 1.0:
+        raise InputError("--preference",
+                         f"{args.preference} is not allowed; 0 (time) to 1 (effort)")
 
 
 def print_plan(case: Case, plan: Plan, alpha: float, beta: float) -> None:

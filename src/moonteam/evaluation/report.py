@@ -68,7 +68,7 @@ def cell(row: dict, column: Column, spread: bool) -> str:
 
 def markdown(document: dict, columns: Sequence[Column]) -> str:
     """The table with its command, sources and machine, ready for a page of docs."""
-    titles = ["planner", *(c.title for c in columns)]
+    titles = [document.get("rows_are", "planner"), *(c.title for c in columns)]
     lines = [f"`{document['meta']['command']}`", "",
              "| " + " | ".join(titles) + " |",
              "|" + "---|" * len(titles)]
