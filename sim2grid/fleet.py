@@ -20,7 +20,7 @@ import numpy.typing as npt
 from moonteam import mission as missions
 from moonteam.errors import InputError
 from moonteam.grid import scenarios
-from moonteam.mission import Event, Map, Mission, Robot, Silent, Site, Slow, Target
+from moonteam.mission import Event, Kind, Map, Mission, Robot, Silent, Site, Slow, Target
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
@@ -34,7 +34,8 @@ from sim2grid.frames import Frame
 from sim2grid.replan import grid_problem, unsolvable, with_target
 from sim2grid.waypoints import waypoints
 
-TEAM = (("hopper", "drone"), ("strider", "legged"), ("rover", "wheeled"))
+TEAM: tuple[tuple[str, Kind], ...] = (
+    ("hopper", "drone"), ("strider", "legged"), ("rover", "wheeled"))
 """Names and kinds of the robots of a random mission."""
 
 MOST_DRAWS = 10_000
@@ -143,7 +144,7 @@ def draw_mission(recipe: Recipe, number: int, site: Ground,
             size=(recipe.side, recipe.side), max_steps=recipe.max_steps, kinds=kinds)
         mission = Mission(
             Map(drawn.size, recipe.cell_m),
-            tuple(Robot(name, robot.kind, robot.skills, robot.at) for (name, _), robot
+            tuple(Robot(name, kind, robot.skills, robot.at) for (name, kind), robot
                   in zip(TEAM, drawn.agents, strict=True)),
             tuple(Target(t.at, t.skills, t.type) for t in drawn.targets),
             recipe.site, f"{recipe.preset}-{recipe.site_seed}-{number}", recipe.max_steps)

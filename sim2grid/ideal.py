@@ -9,7 +9,7 @@ Legend: B worlds, R robots, D decisions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -46,7 +46,7 @@ class IdealBackend:
     def __init__(self, chunk_steps: int):
         self.log_every = chunk_steps
 
-    def reset(self, qpos: npt.ArrayLike, batch: int = 1) -> IdealState:
+    def reset(self, qpos: Any = None, batch: int = 1) -> IdealState:
         """Worlds at qpos [B, 7 R]."""
         del batch
         places = np.array(qpos, float)
