@@ -16,10 +16,9 @@ from sim2grid.page import Raw, cell, folded, mean_interval, page, plot, table, t
 MOST_FAILURES = 200
 """Failed missions that the page lists one by one; report.json has all."""
 
-FIGURES = (("success", "success", 1.0), ("seconds", "mission seconds", 1.0),
-           ("inflation", "decisions over the grid plan", 1.0),
-           ("slowdown", "seconds over the ideal", 1.0))
-"""Summary keys that are drawn with their intervals: key, title, factor."""
+FIGURES = (("success", "success"), ("seconds", "mission seconds"),
+           ("inflation", "decisions over the grid plan"), ("slowdown", "seconds over the ideal"))
+"""Summary keys that are drawn with their intervals, and their titles."""
 
 COLUMNS = (("success", "success", 3), ("seconds", "seconds", 1), ("decisions", "decisions", 1),
            ("inflation", "decisions / plan", 3), ("slowdown", "seconds / ideal", 2),
@@ -78,8 +77,7 @@ def intervals_plot(document: dict[str, Any]) -> str:
     many = len({(line["site"], line["site_seed"]) for line in lines}) > 1
     names = [line["contender"] + (f", {line['site']} {line['site_seed']}" if many else "")
              for line in lines]
-    panels = [(title, [mean_interval(line, key) for line in lines], factor)
-              for key, title, factor in FIGURES]
+    panels = [(title, [mean_interval(line, key) for line in lines]) for key, title in FIGURES]
     return plot(plots.intervals(names, panels), "means with intervals") if names else ""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,20 +96,20 @@ def motion(story: Story, bases: Sequence[int]) -> str:
     return svg(figure)
 
 
-def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any], float]]) -> str:
+def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any]]]) -> str:
     """One panel a figure, one dot with its interval a name.
 
     Args:
       names: of the rows.
-      panels: (title, (value, low, high) a row, factor on all of them); None for no value.
+      panels: (title, (value, low, high) a row); None for no value.
     """
     figure, axes = _axes(WIDTH, 0.8 + 0.36 * len(names), len(panels))
     places = np.arange(len(names))[::-1]
-    for axis, (title, values, factor) in zip(axes, panels, strict=True):
+    for axis, (title, values) in zip(axes, panels, strict=True):
         for place, value in zip(places, values, strict=True):
             if value is None or value[0] is None:
                 continue
-            mean, low, high = (None if v is None else factor * v for v in value)
+            mean, low, high = value
             if low is not None and high is not None:
                 axis.plot([low, high], [place, place], color=hexed(robot_color(0)), lw=4,
                           alpha=0.45, solid_capstyle="butt")
@@ -125,7 +125,7 @@ def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any], f
     return svg(figure)
 
 
-def histograms(title: str, groups: dict[str, Sequence[float]]) -> str:
+def histograms(title: str, groups: Mapping[str, Sequence[float]]) -> str:
     """Shares of one figure's values, a row a group, on common bins."""
     kept = {name: np.asarray(values, float) for name, values in groups.items() if len(values)}
     if not kept:
@@ -133,7 +133,7 @@ def histograms(title: str, groups: dict[str, Sequence[float]]) -> str:
     figure, axes = _axes(WIDTH / 2, 0.7 + 0.62 * len(kept), len(kept), rows=True)
     every = np.concatenate(list(kept.values()))
     low, high = float(every.min()), float(every.max())
-    bins = np.linspace(low, high if high > low else low + 1.0, 31)
+    bins = np.linspace(low, high if high > low else low + 1.0, 31).tolist()
     for i, (axis, (name, values)) in enumerate(zip(axes, kept.items(), strict=True)):
         axis.hist(values, bins=bins, color=hexed(robot_color(i)), alpha=0.85)
         axis.axvline(float(np.median(values)), color=hexed(INK), lw=1.2)

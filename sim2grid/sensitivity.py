@@ -92,8 +92,8 @@ def run_setting(setting: Setting, recipe: Recipe, count: int, contenders: Sequen
 
     `keep` is called with each new row.
     """
-    evaluation = Evaluation([recipe], count, contenders, seed, width, backend, keep, progress,
-                            dict(done))
+    evaluation = Evaluation([recipe], count, contenders, seed, width, backend, keep=keep,
+                            progress=progress, rows=dict(done))
     try:
         fleet = make_fleet(recipe, count, changed_ground(setting))
     except InputError as error:
@@ -118,8 +118,7 @@ class _Shaken(Group):
         fleet = self._fleet
         return NoisyExecution(
             fleet.missions[k], fleet.scenarios[k], make(), fleet.bodies, fleet.frame,
-            seed=self._seed(k), mode=contender.mode, rules=self._rules, route=route,
-            noise_m=self._setting.value)
+            seed=self._seed(k), mode=contender.mode, route=route, noise_m=self._setting.value)
 
     def _backend(self) -> Backend:
         engine = super()._backend()
