@@ -1,8 +1,8 @@
 """The two engines on the real robots: one sequence of commands, two nearly equal drives.
 
 What is left between them: MJX works in single precision and meets a height field facet by
-facet, C MuJoCo in double precision and prism by prism; a wheel that slips a little more on one
-edge then drives a slightly other line.
+facet, C MuJoCo in double precision and prism by prism. Both must be given iterations enough for
+the contact solver to converge: with four, a skidding wheel of the rover was 4 cm off in 5 s.
 """
 
 import jax
@@ -52,6 +52,6 @@ def test_both_engines_drive_the_three_robots_alike(scene):
         assert np.linalg.norm(ours[-1, :2] - scene.qpos0[robot.qpos][:2]) > 0.8
         apart = np.linalg.norm(ours - theirs, axis=1)
         print(f"{robot.name}: at most {1000 * apart.max():.1f} mm apart")
-        assert apart.max() < 0.05, robot.name
+        assert apart.max() < 0.02, robot.name
         energy = (log.power[:, i].mean() for log in (native, mjx))
         assert next(energy) == pytest.approx(next(energy), rel=0.05)
