@@ -52,7 +52,7 @@ class Args:
     """Mission file (.yaml) or the name of a bundled mission; not with --from."""
     planner: Literal["policy", "exact", "greedy"] = "policy"
     """Who decides: a learned policy, the exact planner, or greedy insertion."""
-    policy: str = "small"
+    policy: str = "any_team"
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
     decode: str = "argmax"
     """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""

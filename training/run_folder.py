@@ -189,27 +189,34 @@ def draw_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
     """Success and gaps over labelled states: every family of one run, or the mean of each of
     several runs.
     """
+    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import PercentFormatter
 
-    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)
-    for name, rows in runs.items():
-        states = [row["labelled"] for row in rows]
-        for axis, key in zip(axes, ("success", "makespan_gap", "moves_gap"), strict=True):
+    colours = colormaps["tab20"].colors[::2] + colormaps["tab20"].colors[1::2]
+    keys = ("success", "makespan_gap", "moves_gap")
+    for number, (name, rows) in enumerate(runs.items()):
+        states = [row["labelled"] / 1e6 for row in rows]
+        for axis, key in zip(axes, keys, strict=True):
             table = np.array([[family[key] for family in row["families"]] for row in rows])
             if len(runs) > 1:
-                axis.plot(states, table.mean(axis=1), label=name)
+                axis.plot(states, table.mean(axis=1), color=colours[number], label=name)
                 continue
             for i, family in enumerate(rows[-1]["families"]):
-                axis.plot(states, table[:, i], label=family["family"])
+                axis.plot(states, table[:, i], color=colours[i], label=family["family"])
     for axis, title in zip(axes, ("success, argmax, preference 0", "makespan gap, preference 0",
                                   "moves gap, preference 1"), strict=True):
         axis.set_title(title)
-        axis.set_xlabel("labelled states")
+        axis.set_xlabel("labelled states, millions")
+        axis.grid(alpha=0.3)
+        axis.yaxis.set_major_formatter(PercentFormatter(1.0))
     for axis in axes[1:]:
-        axis.set_yscale("symlog", linthresh=0.01)
-    axes[0].legend(fontsize=7)
+        axis.set_ylim(top=min(axis.get_ylim()[1], 0.5))  # the first looks dwarf the rest
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, ncols=4,
+                  loc="outside lower center")
     with files.replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+        figure.savefig(temporary, dpi=110)
