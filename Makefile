@@ -9,8 +9,8 @@ STAMP := .venv/.installed
 .PHONY: demo test lint check wheel clean
 
 demo: $(STAMP)
-	$(BIN)/moonteam rollout demo --planner policy --out runs/demo
-	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.json"
+	$(BIN)/moonteam rollout outpost --planner policy --out runs/demo
+	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.html"
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=15

@@ -195,7 +195,7 @@ def begin(family: Family, ground: Ground | None, key: Array, count: int) -> Walk
 
 def spread_walk(mesh: Mesh, walk: Walk) -> Walk:
     """The environments shared out over the devices; the key on each of them."""
-    return Walk(*spread(mesh, walk[:-1]), everywhere(mesh, walk.key))
+    return Walk(*spread(mesh, walk[:-1]), key=everywhere(mesh, walk.key))
 
 
 def on_ground(ground: Ground | None, states: State, place: Array | np.ndarray) -> State:

@@ -324,8 +324,9 @@ class Refiner:
         gain = np.where(known, gain, 0.0)
         following = np.where(rollout.truncated, rollout.value[:-1], rollout.value[1:])
         advantage = np.asarray(advantages(
-            gain, rollout.value[:-1], following, rollout.terminated, rollout.truncated,
-            config.gamma, config.gae_lambda))
+            *map(jnp.asarray, (gain, rollout.value[:-1], following, rollout.terminated,
+                               rollout.truncated)),
+            gamma=config.gamma, gae_lambda=config.gae_lambda))
         target = advantage + rollout.value[:-1]
         advantage = (advantage - advantage[known].mean()) / (advantage[known].std() + 1e-6)
         sample = Sample(jax.tree.map(lambda x: x[:-1], rollout.states), rollout.place[:-1],

@@ -43,12 +43,16 @@ class Round(Protocol):
 class Work(Protocol):
     """A training in progress: `Dagger` or `Refiner`."""
 
-    config: Imitation | Refinement
     number: int
     mesh: Mesh
     learner: Learner
     walks: list[Walk]
     memories: list[Memory]
+
+    @property
+    def config(self) -> Imitation | Refinement:
+        """What is trained."""
+        ...
 
     @property
     def done(self) -> bool:
@@ -197,7 +201,7 @@ def draw_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
     figure = Figure(figsize=(13, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)
-    colours = colormaps["tab20"].colors[::2] + colormaps["tab20"].colors[1::2]
+    colours = colormaps["tab20"]([*range(0, 20, 2), *range(1, 20, 2)])
     keys = ("success", "makespan_gap", "moves_gap")
     for number, (name, rows) in enumerate(runs.items()):
         states = [row["labelled"] / 1e6 for row in rows]

@@ -340,7 +340,7 @@ def _wrench(gait: Gait, state: LeggedState, body: _Body) -> Array:
     tilt = jnp.cross(body.rotation[:, 2], up) + jnp.array([0.0, 0.0, 1.0]) * 0.3 * yaw
     spin = jnp.array([0.0, 0.0, 1.0]) * state.wanted[2] - body.spin
     twist = gait.attitude * tilt + gait.attitude_damping * spin
-    moment = times(body.rotation, INERTIA * times(body.rotation.T, twist))
+    moment = times(body.rotation, jnp.asarray(INERTIA) * times(body.rotation.T, twist))
     return jnp.concatenate([force, moment])
 
 
