@@ -247,7 +247,7 @@ def agree(pointer: Array, view: Entities) -> Array:
         logits, missing, waiting = at
         sure = jnp.max(jax.nn.log_softmax(logits, axis=-1), axis=-1)  # [..., N]
         turn = jnp.argmax(jnp.where(waiting, sure, -2.0 * FAR), axis=-1)
-        mine = everyone == turn[..., None]  # [..., N]
+        mine = everyone.reshape((1,) * turn.ndim + (agents,)) == turn[..., None]  # [..., N]
         row = jnp.sum(jnp.where(mine[..., None], logits, 0.0), axis=-2)
         choice = jax.nn.one_hot(jnp.argmax(row, axis=-1), row.shape[-1], dtype=bool)[..., :-1]
         skills = jnp.sum(jnp.where(mine, view.agent_skills, 0), axis=-1)
