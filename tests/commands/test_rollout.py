@@ -58,7 +58,7 @@ def test_bad_missions_one_line_code_two_nothing_written(tmp_path, capsys, old, n
     (["--seed", "-1"], "--seed"),
     (["--decode", "best-of-many"], "--decode"),
     (["--planner", "policy", "--policy", "nobody"], "nobody"),
-    (["--planner", "policy"], "made for 3 robots"),
+    (["--planner", "policy", "--policy", "small"], "made for 3 robots"),
     (["--mission", "3"], "give --from REPORT too"),
     (["--contender", "x"], "give --from REPORT too"),
     (["--from", "report.json"], "not both"),
