@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import compilation, files
 from moonteam.errors import InputError
+from sim2grid import journal
 
 if TYPE_CHECKING:
     from sim2grid.fused import Decider
@@ -69,7 +69,7 @@ def run(args: Args) -> int:
         raise InputError("--seconds", f"{args.seconds:g} is not allowed; 1 to 36000")
     compilation.enable_cache()
     compilation.call_at_once()
-    from moonteam.evaluation.report import plain_markdown, show_plain
+    from moonteam.evaluation.report import print_plain
     from sim2grid import bench
     from sim2grid.fleet import Recipe, make_fleet
 
@@ -84,12 +84,7 @@ def run(args: Args) -> int:
     report = _document(args, rows)
     if args.out is not None:
         files.write_json(args.out / "bench_execution.json", report)
-    if args.json:
-        print(files.dump_json(report))
-    elif args.markdown:
-        print(plain_markdown(report, [table(report)]))
-    else:
-        show_plain(report, [table(report)])
+    print_plain(args, report, [table(report)])
     return 0
 
 
@@ -118,20 +113,14 @@ def _document(args: Args, rows: list[dict[str, Any]]) -> dict[str, Any]:
     from moonteam.evaluation import provenance
     from moonteam.physics.bench import device_name
 
-    default, words = Args(), ["moonteam", "bench", "execution"]
-    for name in ("engine", "missions", "planner", "policy", "site", "site_seed", "targets", "side",
-                 "cell", "max_steps", "seconds", "seed"):
-        value = getattr(args, name)
-        if value != getattr(default, name):
-            several = value if isinstance(value, tuple) else (value,)
-            words += [f"--{name.replace('_', '-')}", *(str(one) for one in several)]
+    command = journal.command("bench execution", args, ("json", "markdown", "out"))
     notes = [
         f"Drone, legged and wheeled robot, {args.targets} targets, {args.side} x {args.side} cells "
         f"of {args.cell:g} m on {args.site}; decisions by {args.planner}"
         + (f" {Path(args.policy).stem}." if args.planner == "policy" else "."),
         "fused: one program on MJX for decisions, control and physics. native, mjx: step by step."]
     return {"title": "execution speed", "command": "bench execution", "device": device_name(),
-            "rows": rows, "notes": notes, "meta": provenance.meta(shlex.join(words), args.seed)}
+            "rows": rows, "notes": notes, "meta": provenance.meta(command, args.seed)}
 
 
 def table(document: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

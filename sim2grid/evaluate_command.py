@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import msgspec
-
-from moonteam import __version__, files
-from moonteam.errors import InputError
+from moonteam import files
+from sim2grid import journal
+from sim2grid.journal import Journal
 
 if TYPE_CHECKING:
     from sim2grid.evaluate import Evaluation, Row
@@ -102,51 +100,43 @@ def run(args: Args) -> int:
     enable_cache()
     call_at_once()
     from moonteam.evaluation import provenance
+    from sim2grid.evaluate import Row
     from sim2grid.summary import document
 
     evaluation = _evaluation(args)
-    journal = _Journal.open(args) if args.out else None
-    if journal:
-        evaluation.rows |= {(row.contender, row.number): row for row in journal.rows}
-        evaluation.keep = journal.add
+    if args.out:
+        held = Journal[Row](args.out, args.resume, _options(args), Row)
+        evaluation.rows |= {(row.contender, row.number): row for row in held.entries}
+        evaluation.keep = held.add
     begun, interrupted = time.perf_counter(), False
     try:
         evaluation.run()
     except KeyboardInterrupt:
         interrupted = True
     rows = evaluation.sorted_rows()
+    command = journal.command("evaluate execution", args, _NOT_REPEATED)
     report = document(rows, evaluation.entries, evaluation.contenders, _options(args),
-                      provenance.meta(_command(args), args.seed), args.seed)
+                      provenance.meta(command, args.seed), args.seed)
     if interrupted:
         report["interrupted"] = True
     if args.out:
         _save(args.out, report, rows)
     _print(args, report)
     _say(f"{len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
-    if interrupted:
-        more = ": --resume goes on" if args.out else ""
-        print(f"moonteam: interrupted{more}", file=sys.stderr)
-        return 130
-    return 0
+    return journal.interrupted(args.out) if interrupted else 0
+
+
+_NOT_REPEATED = ("json", "markdown", "out", "resume", "threads")
+"""Options on which the report does not depend."""
 
 
 def _check(args: Args) -> None:
     """Raises InputError for options out of range."""
-    for name, value, low, high in (
-            ("count", args.count, 1, 100_000), ("targets", args.targets, 1, 64),
-            ("side", args.side, 4, 128), ("max-steps", args.max_steps, 1, 100_000),
-            ("seed", args.seed, 0, 2**31), ("site-seed", args.site_seed, 0, 2**31),
-            ("width", args.width, 1, 4096), ("threads", args.threads, 0, 1024),
-            ("new-targets", args.new_targets, 0, 64), ("cell", args.cell, 0.25, 10),
-            ("lose", args.lose, 0, 1), ("slow", args.slow, 0, 1), ("silent", args.silent, 0, 1)):
-        if not low <= value <= high:
-            raise InputError(f"--{name}", f"{value} is not allowed; {low} to {high}")
-    if args.resume and args.out is None:
-        raise InputError("--resume", "needs the folder of the run to go on with: --out DIR")
-    for name, chosen in (("site", args.site), ("loop", args.loop), ("mode", args.mode),
-                         ("planner", args.planner)):
-        if len(set(chosen)) < len(chosen) or not chosen:
-            raise InputError(f"--{name}", "give each once, and at least one")
+    journal.check(args, (
+        ("count", 1, 100_000), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
+        ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096), ("threads", 0, 1024),
+        ("new_targets", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1), ("slow", 0, 1),
+        ("silent", 0, 1)), choices=("site", "loop", "mode", "planner"))
 
 
 def _evaluation(args: Args) -> Evaluation:
@@ -160,94 +150,16 @@ def _evaluation(args: Args) -> Evaluation:
                      args.decode if name == "policy" else "argmax", args.objective)
            for name in args.planner]
     return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who), args.seed,
-                      args.width, args.backend, args.threads, progress=_progress())
-
-
-def _progress() -> Any:
-    """A line on standard error that is written over, if that is a terminal."""
-    watched = sys.stderr.isatty()
-
-    def show(title: str, done: int, total: int) -> None:
-        if watched:
-            end = "\n" if done == total else ""
-            print(f"\r\x1b[K{title}: {done} of {total} missions", end=end, file=sys.stderr,
-                  flush=True)
-
-    return show
+                      args.width, args.backend, args.threads, progress=journal.progress)
 
 
 def _options(args: Args) -> dict[str, Any]:
     """What the rows depend on; the same in a run and in what resumes it."""
-    left_out = ("json", "markdown", "out", "resume", "threads", "lose", "slow", "silent",
-                "new_targets")
+    left_out = (*_NOT_REPEATED, "lose", "slow", "silent", "new_targets")
     options = {key: value for key, value in asdict(args).items() if key not in left_out}
     rates = {"lose": args.lose, "slow": args.slow, "silent": args.silent,
              "new_targets": args.new_targets}
     return options | {"rates": rates}
-
-
-def _command(args: Args) -> str:
-    """The command that makes this report again; options at their default are left out."""
-    words = ["moonteam", "evaluate", "execution"]
-    for key, value in asdict(args).items():
-        if key in ("json", "markdown", "out", "resume", "threads") or value == getattr(Args, key):
-            continue
-        words += [f"--{key.replace('_', '-')}",
-                  *(map(str, value) if isinstance(value, tuple) else [str(value)])]
-    return shlex.join(words)
-
-
-class _Journal:
-    """The folder's rows.jsonl: a line is added as each mission ends."""
-
-    def __init__(self, path: Path, rows: list[Row]):
-        self.path, self.rows = path, rows
-
-    @classmethod
-    def open(cls, args: Args) -> _Journal:
-        """Starts the folder, or reads what is done if it is to be resumed. Raises InputError."""
-        assert args.out is not None
-        if args.out.exists() and not args.out.is_dir():
-            raise InputError("--out", f"{args.out} is a file; a folder is needed")
-        path, config = args.out / "rows.jsonl", args.out / "config.json"
-        options = {"moonteam": __version__, "options": _options(args)}
-        plain = msgspec.json.decode(files.dump_json(options))
-        if not args.resume:
-            files.write_json(config, options)
-            files.write_text(path, "")
-            return cls(path, [])
-        if not config.exists():
-            raise InputError("--resume", f"{args.out} holds no run to go on with")
-        before = msgspec.json.decode(files.read_text(config))
-        if before != plain:
-            changed = sorted(key for key in plain["options"]
-                             if plain["options"][key] != before.get("options", {}).get(key))
-            raise InputError("--resume", f"{args.out} was made with other options: "
-                             + (", ".join(changed) or "another version of moonteam"))
-        rows = _read(path)
-        files.write_text(path, "".join(files.dump_json(row) + "\n" for row in rows))
-        return cls(path, rows)
-
-    def add(self, row: Row) -> None:
-        """Adds a row; what an interruption cuts off is dropped when the run is resumed."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(files.dump_json(row) + "\n")
-
-
-def _read(path: Path) -> list[Row]:
-    """The whole rows of a journal; half a line at its end is left out."""
-    from sim2grid.evaluate import Row
-
-    rows = []
-    text = files.read_text(path) if path.exists() else ""
-    for number, line in enumerate(text.splitlines(keepends=True), 1):
-        if not line.endswith("\n"):
-            break
-        try:
-            rows.append(msgspec.json.decode(line, type=Row))
-        except msgspec.DecodeError as error:
-            raise InputError(path, f"line {number} is no row: {error}") from None
-    return rows
 
 
 def _save(out: Path, report: dict[str, Any], rows: list[Row]) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
-from moonteam import __version__, files
-from moonteam.errors import InputError
+from moonteam import files
+from sim2grid import journal
+from sim2grid.journal import Journal
 
 if TYPE_CHECKING:
     from sim2grid.evaluate import Row
@@ -96,21 +95,21 @@ def run(args: Args) -> int:
     chosen = contenders(("closed",), args.mode, [who])
     recipe = Recipe(args.site, args.site_seed, args.seed, args.targets, args.side,
                     max_steps=args.max_steps)
-    journal = _Journal(args)
+    rows = _Rows(args)
     interrupted, impossible = False, {}
     try:
         for setting in {s.key: s for s in settings(args.quantity)}.values():
             said = run_setting(
                 setting, recipe, args.count, chosen, seed=args.seed, width=args.width,
-                backend=args.backend, done=journal.of(setting),
-                keep=lambda row, key=setting.key: journal.add(key, row),
-                progress=lambda title, done, total, key=setting.key: _progress(
+                backend=args.backend, done=rows.of(setting),
+                keep=lambda row, key=setting.key: rows.add(key, row),
+                progress=lambda title, done, total, key=setting.key: journal.progress(
                     f"{key}: {title}", done, total))
             if said:
                 impossible[setting.key] = said
     except KeyboardInterrupt:
         interrupted = True
-    report = _document(args, journal.rows, [c.name for c in chosen], impossible)
+    report = _document(args, rows.found, [c.name for c in chosen], impossible)
     if interrupted:
         report["interrupted"] = True
     if args.out:
@@ -119,87 +118,52 @@ def run(args: Args) -> int:
         print(files.dump_json(report))
     else:
         _show(report)
-    if interrupted:
-        more = ": --resume goes on" if args.out else ""
-        print(f"moonteam: interrupted{more}", file=sys.stderr)
-        return 130
-    return 0
+    return journal.interrupted(args.out) if interrupted else 0
+
+
+_NOT_REPEATED = ("json", "out", "resume")
+"""Options on which the report does not depend."""
 
 
 def _check(args: Args) -> None:
     """Raises InputError for options out of range."""
-    for name, value, low, high in (
-            ("count", args.count, 1, 100_000), ("targets", args.targets, 1, 64),
-            ("side", args.side, 4, 128), ("max-steps", args.max_steps, 1, 100_000),
-            ("seed", args.seed, 0, 2**31), ("site-seed", args.site_seed, 0, 2**31),
-            ("width", args.width, 1, 4096)):
-        if not low <= value <= high:
-            raise InputError(f"--{name}", f"{value} is not allowed; {low} to {high}")
-    for name, chosen in (("quantity", args.quantity), ("mode", args.mode)):
-        if len(set(chosen)) < len(chosen) or not chosen:
-            raise InputError(f"--{name}", "give each once, and at least one")
-    if args.resume and args.out is None:
-        raise InputError("--resume", "needs the folder of the run to go on with: --out DIR")
-    if args.out is not None and args.out.exists() and not args.out.is_dir():
-        raise InputError("--out", f"{args.out} is a file; a folder is needed")
+    journal.check(args, (
+        ("count", 1, 100_000), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
+        ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096)),
+        choices=("quantity", "mode"))
 
 
-class _Journal:
-    """The folder's rows.jsonl, each line a setting's key and a row; in memory without --out."""
+class _Rows:
+    """Rows by setting and mission; kept in a journal where there is a folder."""
 
     def __init__(self, args: Args):
-        self.rows: dict[str, dict[tuple[str, int], Row]] = {}
-        self._path = args.out / "rows.jsonl" if args.out else None
-        if args.out is None or self._path is None:
-            return
-        plain = msgspec.json.decode(files.dump_json(
-            {"moonteam": __version__, "options": _options(args)}))
-        config = args.out / "config.json"
-        if args.resume:
-            if not config.exists():
-                raise InputError("--resume", f"{args.out} holds no run to go on with")
-            if msgspec.json.decode(files.read_text(config)) != plain:
-                raise InputError("--resume", f"{args.out} was made with other options")
-            self._read(files.read_text(self._path) if self._path.exists() else "")
-        files.write_json(config, plain)
-        files.write_text(self._path, "".join(
-            self._line(key, row) for key, rows in self.rows.items() for row in rows.values()))
-
-    def _read(self, text: str) -> None:
         from sim2grid.evaluate import Row
 
-        for number, line in enumerate(text.splitlines(keepends=True), 1):
-            if not line.endswith("\n"):
-                return  # cut off by an interruption
-            try:
-                key, row = msgspec.json.decode(line, type=tuple[str, Row])
-            except msgspec.DecodeError as error:
-                raise InputError(self._path, f"line {number} is no row: {error}") from None
-            self._put(key, row)
+        self.found: dict[str, dict[tuple[str, int], Row]] = {}
+        self._journal: Journal[tuple[str, Row]] | None = None
+        if args.out:
+            self._journal = Journal(args.out, args.resume, _options(args), tuple[str, Row])
+            for key, row in self._journal.entries:
+                self._put(key, row)
 
     def _put(self, key: str, row: Row) -> None:
-        self.rows.setdefault(key, {})[row.contender, row.number] = row
-
-    @staticmethod
-    def _line(key: str, row: Row) -> str:
-        return files.dump_json([key, row]) + "\n"
+        self.found.setdefault(key, {})[row.contender, row.number] = row
 
     def of(self, setting: Setting) -> dict[tuple[str, int], Row]:
         """What is done of a setting."""
-        return self.rows.get(setting.key, {})
+        return self.found.get(setting.key, {})
 
     def add(self, key: str, row: Row) -> None:
         """Keeps a row."""
         self._put(key, row)
-        if self._path:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(self._line(key, row))
+        if self._journal:
+            self._journal.add((key, row))
 
 
 def _options(args: Args) -> dict[str, Any]:
     """What the rows depend on."""
     return {key: value for key, value in asdict(args).items()
-            if key not in ("json", "out", "resume")}
+            if key not in _NOT_REPEATED}
 
 
 def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: list[str],
@@ -208,11 +172,7 @@ def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: li
     from moonteam.evaluation import provenance
     from sim2grid.sensitivity import SWEEPS, point, settings
 
-    words = ["moonteam", "evaluate", "sensitivity"]
-    for key, value in _options(args).items():
-        if value != getattr(Args, key):
-            words += [f"--{key.replace('_', '-')}",
-                      *map(str, value if isinstance(value, tuple) else [value])]
+    command = journal.command("evaluate sensitivity", args, _NOT_REPEATED)
     curves = [
         {"quantity": quantity, "label": SWEEPS[quantity].label, "contender": name,
          "points": [{"value": s.value, "impossible": impossible.get(s.key)} | point(
@@ -220,7 +180,7 @@ def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: li
              args.seed) for s in settings([quantity])]}
         for quantity in args.quantity for name in names]
     return {"kind": "sensitivity", "title": "sensitivity of executions",
-            "meta": provenance.meta(shlex.join(words), args.seed), "options": _options(args),
+            "meta": provenance.meta(command, args.seed), "options": _options(args),
             "curves": curves,
             "rows": [{"setting": key} | msgspec.to_builtins(row)
                      for key, found in rows.items() for _, row in sorted(found.items())]}
@@ -244,10 +204,3 @@ def _show(report: dict[str, Any]) -> None:
             print(f"  {at['value']:>6g}  " + (at["impossible"] or (
                 f"{at['solved']} of {at['missions']} missions"
                 + ("" if at["seconds"] is None else f", {at['seconds']:.1f} s"))))
-
-
-def _progress(title: str, done: int, total: int) -> None:
-    """A line on standard error that is written over, if that is a terminal."""
-    if sys.stderr.isatty():
-        end = "\n" if done == total else ""
-        print(f"\r\x1b[K{title}: {done} of {total} missions", end=end, file=sys.stderr, flush=True)

@@ -6,7 +6,6 @@ stated there. Checked when built: an impossible division never reaches the first
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -197,8 +196,3 @@ def preset(name: str) -> Config:
     if name not in PRESETS:
         raise InputError(name, f"no such preset; one of: {', '.join(PRESETS)}")
     return PRESETS[name]
-
-
-def with_seed(config: Config, seed: int) -> Config:
-    """The same run from another seed."""
-    return dataclasses.replace(config, seed=seed)

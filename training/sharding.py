@@ -19,8 +19,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from moonteam.compilation import cores
 from moonteam.errors import InputError
-from moonteam.evaluation.provenance import cores
 
 
 def use_all_cores() -> None:

@@ -106,10 +106,5 @@ def run(args: Args) -> int:
         files.write_json(args.out / "bench.json", document)
         text = report.plain_markdown(document, tables(document))
         files.write_text(args.out / "table.md", text + "\n")
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.plain_markdown(document, tables(document)))
-    else:
-        report.show_plain(document, tables(document))
+    report.print_plain(args, document, tables(document))
     return 0

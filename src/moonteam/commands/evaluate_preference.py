@@ -69,10 +69,5 @@ def run(args: Args) -> int:
         files.write_json(args.out / "report.json", document)
         files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
         figures.preference(args.out / "preference.png", document)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.plain_markdown(document, tables))
-    else:
-        report.show_plain(document, tables)
+    report.print_plain(args, document, tables)
     return 0

@@ -61,12 +61,7 @@ def run(args: Args) -> int:
         files.write_text(args.out / "timing.csv", report.plain_csv(document["rows"]))
         files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
         figures.timing(args.out / "timing.png", document)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.plain_markdown(document, tables))
-    else:
-        report.show_plain(document, tables)
+    report.print_plain(args, document, tables)
     return 0
 
 

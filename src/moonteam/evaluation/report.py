@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from moonteam import files
 from moonteam.evaluation.provenance import hardware_line
@@ -173,6 +174,17 @@ def show_plain(document: dict, tables: Sequence[tuple[list[str], list[list[str]]
         console.print(table)
     for note in (*document["notes"], hardware_line(document["meta"])):
         console.print(note, highlight=False, markup=False)
+
+
+def print_plain(args: Any, document: dict,
+                tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
+    """The document as `--json` or `--markdown` ask for it, else its tables for a person."""
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(plain_markdown(document, tables))
+    else:
+        show_plain(document, tables)
 
 
 def plain_csv(rows: Sequence[dict]) -> str:

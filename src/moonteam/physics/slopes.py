@@ -15,7 +15,6 @@ from moonteam.physics.traverse import Route, Traverse, run_traverses, summarise
 from moonteam.robots.base import RobotKind
 from moonteam.terrain.site import SPACING, Site, rough_ground
 
-WAYS = ("up", "down", "across")
 SLOPED, LEVEL = 8.0, 2.5  # m, of a drive's 13 m: on the plane, and before and after it
 BLEND = 4.0  # m over which level ground turns into a plane to be crossed
 HALF_LENGTH, HALF_WIDTH = 9.0, 4.0  # m, of the ground

@@ -10,7 +10,6 @@ Numba's cache of this file looks at this file's own date alone, and holds what i
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from moonteam.compilation import cores
 from moonteam.errors import InputError
 from moonteam.planners import insertion, search
 from moonteam.planners.base import IntArray, Objective
@@ -250,13 +250,6 @@ def _solve_range(first, last, cells, kinds, skills, target_cells, target_skills,
             cells[b], kinds[b], skills[b], target_cells[b], target_skills[b], target_and[b],
             solved[b], horizon[b], ground, alpha[b], beta[b], limit, exact_to, iterations, b,
             routes[b], next_target[b], arrival[b], meeting[b])
-
-
-def cores() -> int:
-    """Cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def solve_batch(

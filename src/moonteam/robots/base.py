@@ -83,12 +83,6 @@ def turned(matrix: Array, vectors: Array) -> Array:
     return jnp.sum(matrix[None] * vectors[:, None, :], axis=-1)
 
 
-def quat_rotate(quat: Array, vector: Array) -> Array:
-    """Rotates a body-frame vector [3] into the world by a unit quaternion wxyz [4]."""
-    w, u = quat[0], quat[1:]
-    return vector + 2.0 * jnp.cross(u, jnp.cross(u, vector) + w * vector)
-
-
 def quat_matrix(quat: Array) -> Array:
     """Rotation matrix [3, 3], body to world, of a unit quaternion wxyz [4]."""
     w, x, y, z = quat
