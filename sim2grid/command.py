@@ -199,7 +199,7 @@ def _from_report(args: Args) -> Run:
     words = ["moonteam", "rollout", "--from", str(args.report), "--mission", str(row.number),
              "--contender", contender.name]
     return Run(staged.prepared, staged.execution, staged.prepared.scene.qpos0, staged.grid_plan,
-               row.report.planner, row.report.objective, staged.backend, row.seed,
+               row.report.planner, row.report.objective, contender.backend, row.seed,
                f"mission {row.number}, {row.site}: {contender.name}", shlex.join(words),
                staged.width, row.slot, row.report)
 

@@ -14,6 +14,7 @@ repeated alone to the bit. Legend: F missions of a fleet, B rows of the engine.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,6 +54,7 @@ class Contender(msgspec.Struct, frozen=True):
     policy: str | None = None  # file or name of a bundled one
     decode: str = "argmax"
     objective: Objective = "makespan"
+    backend: str = "native"  # engine; without meaning for the loop `grid`
 
     @property
     def who(self) -> str:
@@ -64,9 +66,13 @@ class Contender(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """Such as `closed exact barrier`; open loop and grid have no mode to choose."""
+        """Such as `closed exact barrier`; open loop and grid have no mode to choose.
+
+        The engine is named where it is not the native one.
+        """
         words = [self.loop] + ([self.who] if self.loop != "oracle" else [])
-        return " ".join(words + ([self.mode] if self.loop in ("closed", "oracle") else []))
+        words += [self.mode] if self.loop in ("closed", "oracle") else []
+        return " ".join(words + ([self.backend] if self.backend != "native" else []))
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -113,7 +119,6 @@ class Evaluation:
     contenders: Sequence[Contender]
     seed: int = 0
     width: int = 25  # B
-    backend: str = "native"
     threads: int = 0  # of the native engine, 0 for all CPUs
     keep: Callable[[Row], None] = lambda row: None
     progress: Callable[[str, int, int], None] = lambda title, done, total: None
@@ -143,7 +148,7 @@ class Group:
         self._all, self._fleet, self._first = evaluation, fleet, first
         self._height = ground_height(fleet.site.heights, fleet.site.spacing)
         self._width = min(evaluation.width, len(fleet.missions))
-        self._engine: Backend | None = None
+        self._engines: dict[str, Backend] = {}
         self._plans: dict[tuple, list[OnGrid]] = {}
 
     def run(self) -> None:
@@ -178,16 +183,16 @@ class Group:
             self._all.progress(title, done, len(self._fleet.missions))
 
         self._all.progress(title, done, len(self._fleet.missions))
-        run(executions, self._backend(), self._fleet.starts[todo], width=self._width,
-            rows=[k % self._width for k in todo], finished=finished)
+        run(executions, self._backend(contender.backend), self._fleet.starts[todo],
+            width=self._width, rows=[k % self._width for k in todo], finished=finished)
 
-    def _backend(self) -> Backend:
-        if self._engine is None:
+    def _backend(self, name: str) -> Backend:
+        if name not in self._engines:
             from moonteam.physics.backends import make_backend
 
-            self._engine = make_backend(
-                self._all.backend, self._fleet.scene, threads=self._all.threads)
-        return self._engine
+            self._engines[name] = make_backend(
+                name, self._fleet.scene, threads=self._all.threads)
+        return self._engines[name]
 
     def _execution(self, contender: Contender, make: Callable[[], Planner], k: int,
                    route: Route | None) -> Execution:
@@ -203,7 +208,7 @@ class Group:
         return make_report(
             record, self._fleet.missions[k], self._fleet.frame, self._fleet.bases,
             planner=contender.who, objective=objective, mode=contender.mode,
-            backend=self._all.backend, seed=self._seed(k), grid_plan=plan, height=self._height)
+            backend=contender.backend, seed=self._seed(k), grid_plan=plan, height=self._height)
 
     def _keep(self, contender: Contender, k: int, report: Report, grid: OnGrid) -> None:
         recipe = self._fleet.missions[k].site
@@ -264,14 +269,16 @@ def maker(contender: Contender) -> Callable[[], Planner]:
                          decode=contender.decode)
 
 
-def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender]
-               ) -> list[Contender]:
+def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],
+               backends: Sequence[str] = ("native",)) -> list[Contender]:
     """All combinations that mean something, each once; `planners` give who decides."""
     found: dict[str, Contender] = {}
     exact = Contender("oracle", "barrier", "exact")
     for loop in loops:
-        for mode in modes if loop in ("closed", "oracle") else ("barrier",):
+        for mode, backend in itertools.product(
+                modes if loop in ("closed", "oracle") else ("barrier",),
+                backends if loop != "grid" else ("native",)):
             for who in planners if loop != "oracle" else (exact,):
-                one = msgspec.structs.replace(who, loop=loop, mode=mode)
+                one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
                 found.setdefault(one.name, one)
     return list(found.values())

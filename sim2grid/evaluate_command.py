@@ -37,6 +37,7 @@ class Args:
       moonteam evaluate execution --site mare highland --count 100 --out runs/execution
       moonteam evaluate execution --planner exact --loop closed open grid --mode barrier async
       moonteam evaluate execution --site flat --count 8 --lose 1 --out runs/lose --resume
+      moonteam evaluate execution --backend native mjx --count 10 --out runs/backends
       moonteam evaluate execution --count 20 --new-targets 5 --slow 0.5 --silent 0.5 --json
     """
 
@@ -76,8 +77,8 @@ class Args:
     """New targets that appear in mid-mission, each at a random decision."""
     seed: int = 0
     """Seed of the missions, their events and the planners."""
-    backend: Literal["native", "mjx"] = "native"
-    """Physics engine: C MuJoCo, or MJX for accelerators."""
+    backend: tuple[Literal["native", "mjx"], ...] = ("native",)
+    """Physics engines: C MuJoCo, MJX for accelerators, or both beside each other."""
     width: int = 25
     """Worlds that the engine advances together."""
     threads: int = 0
@@ -136,7 +137,7 @@ def _check(args: Args) -> None:
         ("count", 1, 100_000), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
         ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096), ("threads", 0, 1024),
         ("new_targets", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1), ("slow", 0, 1),
-        ("silent", 0, 1)), choices=("site", "loop", "mode", "planner"))
+        ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
 
 
 def _evaluation(args: Args) -> Evaluation:
@@ -149,8 +150,8 @@ def _evaluation(args: Args) -> Evaluation:
     who = [Contender("closed", "barrier", name, args.policy if name == "policy" else None,
                      args.decode if name == "policy" else "argmax", args.objective)
            for name in args.planner]
-    return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who), args.seed,
-                      args.width, args.backend, args.threads, progress=journal.progress)
+    return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who, args.backend),
+                      args.seed, args.width, args.threads, progress=journal.progress)
 
 
 def _options(args: Args) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from sim2grid import plots
 from sim2grid.page import Raw, cell, folded, mean_interval, page, plot, table, tiles
+from sim2grid.summary import COMPARED, DIFFERENT
 
 MOST_FAILURES = 200
 """Failed missions that the page lists one by one; report.json has all."""
@@ -43,7 +44,8 @@ def evaluation_page(document: dict[str, Any], source: str = "report.json") -> st
         '<p class="bad">Interrupted: what is done so far.</p>' if document.get("interrupted")
         else "",
         "<h2>Means with 95 % intervals</h2>", summary_table(document), intervals_plot(document),
-        *_section("Async over barrier", comparisons_table(document)),
+        *_section("One against another", comparisons_table(document)),
+        *_section("Missions that went otherwise", differences_table(document)),
         *_section("Failures by cause", causes_table(document, source)),
         *_section("Every failed mission", failures_table(document, source)),
         "<h2>Distributions</h2>", histogram_plots(document),
@@ -82,13 +84,19 @@ def intervals_plot(document: dict[str, Any]) -> str:
 
 
 def comparisons_table(document: dict[str, Any]) -> str:
-    """Async against barrier on the missions that both solved."""
+    """Async against barrier, engine against engine, on the missions that both solved."""
     return "" if not document.get("comparisons") else table(
-        ["site", "contender", "over", "both solved", "only async", "only barrier",
-         "seconds, ratio", "moves, ratio"],
+        COMPARED,
         [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
-          f"{c['both_solved']} of {c['missions']}", c["only_async"], c["only_barrier"],
+          f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
           _spread(c, "seconds", 3), _spread(c, "moves", 3)] for c in document["comparisons"]])
+
+
+def differences_table(document: dict[str, Any]) -> str:
+    """Missions in which another engine led to another outcome or number of decisions."""
+    return "" if not document.get("differences") else table(DIFFERENT, [
+        [f"{d['site']} {d['site_seed']}", d["number"], d["contender"], d["this"], d["over"],
+         d["other"], d["why"]] for d in document["differences"]])
 
 
 def causes_table(document: dict[str, Any], source: str) -> str:

@@ -36,7 +36,6 @@ class Staged:
     grid_plan: GridPlan
     row: Row
     width: int
-    backend: str
 
     def run(self, backend: Backend, progress: Callable[[], None] = lambda: None) -> None:
         """Runs the execution to its end on an engine of `prepared.scene`."""
@@ -84,8 +83,7 @@ def restage(report: dict[str, Any], number: int, source: object,
                           seed=row.seed, mode=chosen.mode, route=route)
     options = report["options"]
     width = min(int(options["width"]), int(options["count"]))
-    return Staged(chosen, prepared, planner, execution, grid.plan, row, width,
-                  str(options["backend"]))
+    return Staged(chosen, prepared, planner, execution, grid.plan, row, width)
 
 
 def _contender(report: dict[str, Any], name: str | None, source: object) -> Contender:

@@ -86,13 +86,13 @@ def settings(quantities: Sequence[Quantity]) -> list[Setting]:
 
 
 def run_setting(setting: Setting, recipe: Recipe, count: int, contenders: Sequence[Contender], *,
-                seed: int, width: int, backend: str, done: dict[tuple[str, int], Row],
+                seed: int, width: int, done: dict[tuple[str, int], Row],
                 keep: Callable[[Row], None], progress: Callable[[str, int, int], None]) -> str:
     """Runs the missions of one setting that are not `done`; returns why there are none, or "".
 
     `keep` is called with each new row.
     """
-    evaluation = Evaluation([recipe], count, contenders, seed, width, backend, keep=keep,
+    evaluation = Evaluation([recipe], count, contenders, seed, width, keep=keep,
                             progress=progress, rows=dict(done))
     try:
         fleet = make_fleet(recipe, count, changed_ground(setting))
@@ -120,10 +120,10 @@ class _Shaken(Group):
             fleet.missions[k], fleet.scenarios[k], make(), fleet.bodies, fleet.frame,
             seed=self._seed(k), mode=contender.mode, route=route, noise_m=self._setting.value)
 
-    def _backend(self) -> Backend:
-        engine = super()._backend()
+    def _backend(self, name: str) -> Backend:
+        engine = super()._backend(name)
         if self._setting.quantity == "delay" and not isinstance(engine, DelayedBackend):
-            engine = self._engine = DelayedBackend(engine, self._setting.value)
+            engine = self._engines[name] = DelayedBackend(engine, self._setting.value)
         return engine
 
 

@@ -92,7 +92,7 @@ def run(args: Args) -> int:
                     args.policy if args.planner == "policy" else None,
                     args.decode if args.planner == "policy" else "argmax")
     maker(who)  # refuses a policy that is not there before anything is written
-    chosen = contenders(("closed",), args.mode, [who])
+    chosen = contenders(("closed",), args.mode, [who], [args.backend])
     recipe = Recipe(args.site, args.site_seed, args.seed, args.targets, args.side,
                     max_steps=args.max_steps)
     rows = _Rows(args)
@@ -101,7 +101,7 @@ def run(args: Args) -> int:
         for setting in {s.key: s for s in settings(args.quantity)}.values():
             said = run_setting(
                 setting, recipe, args.count, chosen, seed=args.seed, width=args.width,
-                backend=args.backend, done=rows.of(setting),
+                done=rows.of(setting),
                 keep=lambda row, key=setting.key: rows.add(key, row),
                 progress=lambda title, done, total, key=setting.key: journal.progress(
                     f"{key}: {title}", done, total))

@@ -6,7 +6,8 @@ The document is `report.json` of `moonteam evaluate execution`:
 - `options`: everything that the missions and their executions depend on.
 - `contenders`: `name` with loop, mode, planner, policy, decode, objective.
 - `summary`: a row for each site and contender, figures with `intervals` of 95 %.
-- `comparisons`: async over barrier, on missions that both solved.
+- `comparisons`: async over barrier and one engine over the other, on missions that both solved.
+- `differences`: missions that went otherwise on another engine, and what differed.
 - `failures`: for each site and contender, cause -> mission numbers.
 - `missions`: number, draws and the whole mission as in its file.
 - `rows`: a row for each mission and contender; `report` is that of `moonteam rollout`.
@@ -45,6 +46,7 @@ def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence
         "summary": [heads[key] | _about(by_name[key[2]]) | summarise(group, seed)
                     for key, group in used.items()],
         "comparisons": compare(used, by_name, seed),
+        "differences": differences(used, by_name),
         "failures": [heads[key] | {"causes": failures(group)} for key, group in used.items()],
         "notes": notes(options),
         "missions": [msgspec.to_builtins(entry) for entry in entries],
@@ -53,7 +55,8 @@ def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence
 
 
 def _about(contender: Contender) -> dict[str, str]:
-    return {"loop": contender.loop, "planner": contender.who, "mode": contender.mode}
+    return {"loop": contender.loop, "planner": contender.who, "mode": contender.mode,
+            "backend": contender.backend}
 
 
 def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
@@ -127,30 +130,75 @@ def failures(rows: Sequence[Row]) -> dict[str, list[int]]:
 
 def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Contender],
             seed: int) -> list[dict[str, Any]]:
-    """Async over barrier: seconds and moves on the missions that both solved."""
+    """Async over barrier, and another engine over the native one: seconds and moves on the
+    missions that both solved.
+    """
     found = []
     for (site, site_seed, name), rows in groups.items():
-        one = by_name[name]
-        if one.mode != "async":
-            continue
-        other = msgspec.structs.replace(one, mode="barrier").name
-        before = {row.number: row for row in groups.get((site, site_seed, other), [])}
-        pairs = [(row.report, before[row.number].report) for row in rows if row.number in before]
-        both = [(a, b) for a, b in pairs if a.success and b.success]
-        if not both:
-            continue
-        boot = Bootstrap(len(both), seed)
-        figures = {"seconds": boot.ratio([a.seconds for a, _ in both],
-                                         [b.seconds for _, b in both]),
-                   "moves": boot.ratio([a.moves for a, _ in both], [b.moves for _, b in both])}
-        found.append({
-            "site": site, "site_seed": site_seed, "contender": name, "over": other,
-            "missions": len(pairs), "both_solved": len(both),
-            "only_async": sum(a.success and not b.success for a, b in pairs),
-            "only_barrier": sum(b.success and not a.success for a, b in pairs),
-            **{key: _plain(figure.value) for key, figure in figures.items()},
-            "intervals": {key: _ends(figure) for key, figure in figures.items()}})
+        for other in _others(by_name[name]):
+            before = {row.number: row for row in groups.get((site, site_seed, other), [])}
+            pairs = [(row.report, before[row.number].report) for row in rows
+                     if row.number in before]
+            both = [(a, b) for a, b in pairs if a.success and b.success]
+            if not both:
+                continue
+            boot = Bootstrap(len(both), seed)
+            figures = {key: boot.ratio(*zip(*((getattr(a, key), getattr(b, key))
+                                              for a, b in both), strict=True))
+                       for key in ("seconds", "moves")}
+            found.append({
+                "site": site, "site_seed": site_seed, "contender": name, "over": other,
+                "missions": len(pairs), "both_solved": len(both),
+                "only_this": sum(a.success and not b.success for a, b in pairs),
+                "only_other": sum(b.success and not a.success for a, b in pairs),
+                **{key: _plain(figure.value) for key, figure in figures.items()},
+                "intervals": {key: _ends(figure) for key, figure in figures.items()}})
     return found
+
+
+def _others(one: Contender) -> list[str]:
+    """Names of the contenders that one is held against."""
+    changes = [{"mode": "barrier"}] if one.mode == "async" else []
+    changes += [{"backend": "native"}] if one.backend != "native" else []
+    return [msgspec.structs.replace(one, **change).name for change in changes]
+
+
+def differences(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Contender]
+                ) -> list[dict[str, Any]]:
+    """Missions in which success or decisions are not those of the native engine."""
+    found = []
+    for (site, site_seed, name), rows in groups.items():
+        if by_name[name].backend == "native":
+            continue
+        other = msgspec.structs.replace(by_name[name], backend="native").name
+        before = {row.number: row for row in groups.get((site, site_seed, other), [])}
+        for row in rows:
+            twin = before.get(row.number)
+            if twin is None or _course(row) == _course(twin):
+                continue
+            found.append({"site": site, "site_seed": site_seed, "number": row.number,
+                          "contender": name, "over": other, "this": _told(row),
+                          "other": _told(twin), "why": _why(row, twin)})
+    return found
+
+
+def _course(row: Row) -> tuple[bool, int]:
+    return row.report.success, row.report.decisions
+
+
+def _told(row: Row) -> str:
+    report = row.report
+    end = "solved" if report.success else failure_label(row)
+    return f"{end}, {report.decisions} decisions, {report.seconds:.1f} s"
+
+
+def _why(row: Row, twin: Row) -> str:
+    """What the robots' logs say otherwise."""
+    said = [f"{a.name}: {key.replace('_', ' ')} {getattr(a, key)} against {getattr(b, key)}"
+            for a, b in zip(row.report.robots, twin.report.robots, strict=True)
+            for key in ("timeouts", "wrong_cells", "falls", "stuck", "lost")
+            if getattr(a, key) != getattr(b, key)]
+    return "; ".join(said) or "the same time-outs and wrong cells; one more or one less move"
 
 
 def notes(options: dict[str, Any]) -> list[str]:
@@ -169,6 +217,11 @@ def notes(options: dict[str, Any]) -> list[str]:
 
 Table = tuple[list[str], list[list[str]]]
 
+COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
+            "seconds, ratio", "moves, ratio"]
+DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what differs"]
+"""Titles of the comparisons and of the differences between engines."""
+
 
 def tables(report: dict[str, Any]) -> list[Table]:
     """The summary, the comparison of modes and the failures, for Markdown or a terminal."""
@@ -181,7 +234,7 @@ def tables(report: dict[str, Any]) -> list[Table]:
     for line in report["summary"]:
         physical = line["loop"] != "grid"
         cells = [f"{line['site']} {line['site_seed']}", line["loop"], line["planner"],
-                 line["mode"] if line["loop"] in ("closed", "oracle") else "-",
+                 _mode(line),
                  f"{line['solved']} of {line['missions']}, {_spread(line, 'success', 3)}"]
         if events:
             cells.append(f"{line['solved']} of {line['solvable']}, "
@@ -194,18 +247,28 @@ def tables(report: dict[str, Any]) -> list[Table]:
         rows.append(cells)
     found: list[Table] = [(titles, rows)]
     if report["comparisons"]:
-        found.append((["site", "contender", "over", "both solved", "only async", "only barrier",
-                       "seconds, ratio", "moves, ratio"],
+        found.append((COMPARED,
                       [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
-                        f"{c['both_solved']} of {c['missions']}", str(c["only_async"]),
-                        str(c["only_barrier"]), _spread(c, "seconds", 3), _spread(c, "moves", 3)]
+                        f"{c['both_solved']} of {c['missions']}", str(c["only_this"]),
+                        str(c["only_other"]), _spread(c, "seconds", 3), _spread(c, "moves", 3)]
                        for c in report["comparisons"]]))
+    if report["differences"]:
+        found.append((DIFFERENT, [
+            [f"{d['site']} {d['site_seed']}", str(d["number"]), d["contender"], d["this"],
+             d["over"], d["other"], d["why"]] for d in report["differences"]]))
     causes = [[f"{line['site']} {line['site_seed']}", line["contender"], cause, str(len(numbers)),
                _numbers(numbers)]
               for line in report["failures"] for cause, numbers in line["causes"].items()]
     if causes:
         found.append((["site", "contender", "cause of failure", "missions", "numbers"], causes))
     return found
+
+
+def _mode(line: dict[str, Any]) -> str:
+    """The mode where there is one, and the engine where it is not the native one."""
+    words = [line["mode"]] if line["loop"] in ("closed", "oracle") else []
+    words += [line["backend"]] if line["backend"] != "native" else []
+    return " ".join(words) or "-"
 
 
 def csv_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from sim2grid import evaluate
 from sim2grid.evaluate import Contender, Evaluation, Row, contenders
 from sim2grid.fleet import Rates, Recipe, make_fleet
 from sim2grid.restage import load_report, restage
-from sim2grid.summary import failure_label, summarise
+from sim2grid.summary import document, failure_label, summarise
 
 EXACT = Contender("closed", "barrier", "exact")
 RECIPE = Recipe("flat", 0, 5, num_targets=2, side=6)
@@ -78,10 +78,11 @@ def sliding(monkeypatch):
     """Evaluations run on sliding points; returns the options of their engines."""
     options = {}
 
-    def engine(self):
-        if self._engine is None:
-            self._engine = SlidingRows(self._fleet.scene, **options)
-        return self._engine
+    def engine(self, name):
+        if name not in self._engines:
+            pull = {"pull": 0.8} if name == "mjx" else {}
+            self._engines[name] = SlidingRows(self._fleet.scene, **options | pull)
+        return self._engines[name]
 
     monkeypatch.setattr(evaluate.Group, "_backend", engine)
     monkeypatch.setattr(evaluate, "make_fleet", fleets)
@@ -188,6 +189,36 @@ def test_figures_of_rows_known_by_arithmetic(sliding):
     assert figures["wrong_cell_rate"] == 0.0
     low, high = figures["intervals"]["success"]
     assert 0 <= low <= 0.8 <= high <= 1
+
+
+def test_engines_are_held_against_each_other(sliding):
+    who = contenders(["grid", "closed"], ["barrier"], [EXACT], ["native", "mjx"])
+    assert [c.name for c in who] == [
+        "grid exact", "closed exact barrier", "closed exact barrier mjx"]
+    done = table(who)
+    rows = done.sorted_rows()
+    report = document(rows, done.entries, who, {}, {}, 0)
+    (line,) = report["comparisons"]
+    native = [row.report for row in rows if row.contender == "closed exact barrier"]
+    mjx = [row.report for row in rows if row.contender == "closed exact barrier mjx"]
+    assert {r.backend for r in mjx} == {"mjx"}
+    assert line["seconds"] == pytest.approx(
+        sum(r.seconds for r in mjx) / sum(r.seconds for r in native))
+    assert line["seconds"] > 1.0  # its points are pulled less hard
+    assert report["differences"] == []  # the same decisions in every mission
+    odd = next(row for row in rows if row.contender.endswith("mjx"))
+    robots = (msgspec.structs.replace(odd.report.robots[0], timeouts=1), *odd.report.robots[1:])
+    failed = msgspec.structs.replace(odd, report=msgspec.structs.replace(
+        odd.report, success=False, cause="max_steps", robots=robots))
+    changed = [failed if row is odd else row for row in rows]
+    report = document(changed, done.entries, who, {}, {}, 0)
+    (found,) = report["differences"]
+    assert found["number"] == odd.number
+    assert found["why"] == f"{robots[0].name}: timeouts 1 against 0"
+    assert found["this"].startswith("max steps, ")
+    assert found["other"].startswith("solved, ")
+    (line,) = report["comparisons"]
+    assert (line["both_solved"], line["only_other"], line["only_this"]) == (4, 1, 0)
 
 
 def command(*words):
