@@ -298,7 +298,7 @@ def imitate_loss(decision: Decision, view: Entities, pointer: Array | np.ndarray
 
 def optimiser(config: Imitation) -> optax.GradientTransformation:
     """AdamW with warm-up and a cosine to zero over the whole run."""
-    total = config.rounds * config.batches * len(config.families)
+    total = max(2, config.rounds * config.batches * len(config.families))
     rate = optax.warmup_cosine_decay_schedule(0.0, config.lr, min(200, total // 10 + 1), total)
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=1e-4))
 
@@ -350,8 +350,8 @@ class Round(NamedTuple):
 class Dagger:
     """An imitation run in progress; `round()` until `done`, `learner.mean` is the policy."""
 
-    def __init__(self, config: Imitation):
-        """Makes grounds, environments and fresh parameters from the config's seed."""
+    def __init__(self, config: Imitation, params: Any = None):
+        """Makes grounds and environments from the config's seed, parameters too if not given."""
         from moonteam.policies import entity
 
         self.config = config
@@ -359,7 +359,7 @@ class Dagger:
                              for size in (config.num_envs, config.batch_size))
         self.number = 0
         keys = jax.random.split(jax.random.key(config.seed), len(config.families) + 1)
-        params = entity.init(config.spec, keys[0])
+        params = entity.init(config.spec, keys[0]) if params is None else params
         mean = jax.tree.map(jnp.copy, params)
         self.learner = everywhere(self.mesh, Learner(params, mean, optimiser(config).init(params)))
         self.grounds = [everywhere(self.mesh, make_ground(f, config.seed + i))

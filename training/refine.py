@@ -10,14 +10,11 @@ from typing import Literal
 import msgspec
 import tyro
 
-from moonteam import paths
 from moonteam.errors import InputError
 from moonteam.evaluation.progress import say
-from moonteam.planners.learned import EntityBrain, Policy
-from training.imitate import PRESETS, complete
+from training.imitate import PRESETS, complete, entity_policy
 from training.refinement import Refinement, Refiner
 from training.run_folder import Run, draw_curve
-from training.sharding import use_all_cores
 
 
 @dataclass(frozen=True)
@@ -66,18 +63,14 @@ def run(args: Args) -> int:
     if args.rounds < 1:
         raise InputError("--rounds", f"{args.rounds} is not allowed; at least 1")
     others = {str(folder): _rows(folder) for folder in args.beside}
-    path = paths.find(args.policy, "policies", ".safetensors")
-    use_all_cores()
-    policy = Policy.load(path)
-    if not isinstance(policy.brain, EntityBrain):
-        raise InputError(path, "is a network for one team size; only entity policies are refined")
+    spec, params = entity_policy(args.policy)
     config = Refinement(
-        families=PRESETS[args.families].families, spec=policy.brain.spec, reward=args.reward,
+        families=PRESETS[args.families].families, spec=spec, reward=args.reward,
         rounds=args.rounds, lr=args.lr, leash=args.leash, seed=args.seed)
     out = args.out or Path("runs") / f"refine-{args.seed}"
     say("moonteam: making grounds and held-out scenarios, compiling")
     work = Run("refine", f"MAPPO from imitation, reward {args.reward}",
-               Refiner(config, policy.source.params), out, args.resume, str(args.policy))
+               Refiner(config, params), out, args.resume, str(args.policy))
     code = complete(work, args.json)
     if others and code == 0:
         draw_curve(out / "beside.png", {str(out): work.rows} | others)

@@ -10,9 +10,10 @@ from moonteam.errors import InputError
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.learned import LearnedPlanner
+from moonteam.policies.checkpoint import load_policy
 from moonteam.policies.entity import EntitySpec
 from moonteam.scenario import Agent, Scenario, Target
-from training import run_folder
+from training import imitate, run_folder
 from training.imitation import TIE_BREAK, Dagger, Family, Imitation, Memory, begin, label
 from training.loop import Stop
 from training.run_folder import Run
@@ -108,3 +109,23 @@ def test_impossible_numbers():
     Imitation(families=(Family(3, 20, iterations=50),))
     with pytest.raises(InputError, match="capacity"):
         dataclasses.replace(TINY, capacity=50)
+
+
+def test_a_run_begins_with_another_ones_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_folder, "SCENARIOS", 4)
+    monkeypatch.setitem(imitate.PRESETS, "quick", TINY)
+    first = Run("tiny", "imitation", Dagger(dataclasses.replace(TINY, rounds=1)), tmp_path / "a",
+                False)
+    assert first.train(Stop())
+    first.finish()
+    policy = tmp_path / "a" / "policy.safetensors"
+    words = ["quick", "--begin", str(policy), "--rounds", "1", "--lr", "1e-9", "--json"]
+    assert imitate.run(imitate.parse([*words, "--out", str(tmp_path / "b")])) == 0
+    before, after = (load_policy(tmp_path / name / "policy.safetensors") for name in "ab")
+    for a, b in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-7)
+    assert after.recipe["source"] == str(policy)
+    with pytest.raises(InputError, match="only entity policies"):
+        imitate.run(imitate.parse(["quick", "--begin", "small"]))
+    with pytest.raises(InputError, match="above 0"):
+        imitate.run(imitate.parse(["quick", "--lr", "0"]))
