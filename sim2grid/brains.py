@@ -80,8 +80,6 @@ def planner_maker(name: str, *, policy: Path | None = None, objective: Objective
 
     how = parse(decode)
     loaded = Policy.load(policy)
-    if how.symmetric:
-        loaded = loaded.symmetrised()
     if how.rollouts > 1:
         return partial(BestOfPlanner, loaded, how.rollouts, objective, how.temperature)
     return partial(LearnedPlanner, loaded, "sample" if how.sample else "argmax",

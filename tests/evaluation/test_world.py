@@ -192,16 +192,14 @@ def test_best_of_prefers_success_then_the_objective():
 
 @pytest.mark.parametrize("text", ["best-of-0", "best-of-", "best-of-x", "best-of--3", "beam",
                                   "best-of-1000000", "", "sample@0", "sample@hot",
-                                  "plain-argmax@2", "argmax-sum"])
+                                  "plain-argmax@2", "argmax-sym"])
 def test_unknown_decodings_are_refused(text):
     with pytest.raises(InputError, match="--decode"):
         parse(text)
 
 
-def test_temperature_and_symmetry_are_part_of_the_decoding():
+def test_temperature_is_part_of_the_decoding():
     assert parse("sample@0.25").temperature == 0.25
-    assert parse("best-of-16-sym@0.250").name == "best-of-16-sym@0.25"
+    assert parse("best-of-16@0.250").name == "best-of-16@0.25"
     assert parse("argmax@1.0") == parse("argmax")
     assert parse("sample@0.5") == parse("sample")
-    assert parse("argmax-sym").watch
-    assert parse("argmax-sym").symmetric

@@ -1,4 +1,4 @@
-"""The policy for any team as a planner: blocked ground, few shapes, symmetry, early endings."""
+"""The policy for any team as a planner: blocked ground, few shapes, early endings."""
 
 import dataclasses
 
@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from moonteam.errors import InputError
 from moonteam.grid import scenarios
 from moonteam.planners import learned, simulate
 from moonteam.planners.base import Snapshot
@@ -117,28 +116,3 @@ def test_a_plan_over_blocked_ground_replays(policy):
     plan = plan_best_of(policy, now, 32, seed=1)
     assert plan.status == "feasible"
     assert simulate.replay(now, plan.actions).complete
-
-
-def test_averaged_over_symmetries_it_turns_with_the_map(policy):
-    brain = policy.symmetrised().brain
-    now = moment(4, seed=6)
-    flipped = dataclasses.replace(now, cells=now.cells * [-1, 1] + [7, 0],
-                                  target_cells=now.target_cells * [-1, 1] + [7, 0])
-    turned = dataclasses.replace(now, cells=now.cells[:, ::-1].copy(),
-                                 target_cells=now.target_cells[:, ::-1].copy())
-
-    def probs(snapshot, brain=brain):
-        state = learned.state_of(dataclasses.replace(
-            snapshot, cells=snapshot.cells.astype(np.int32),
-            target_cells=snapshot.target_cells.astype(np.int32)))
-        return np.exp(learned._decide(brain, policy.params, (), state, None, np.int32(60),
-                                      np.float32(0.0))[1])
-
-    plain = probs(now)
-    np.testing.assert_allclose(plain.sum(-1), 1.0, atol=1e-4)
-    np.testing.assert_allclose(probs(flipped), plain[:, [0, 1, 3, 2, 4]], atol=1e-4)
-    np.testing.assert_allclose(probs(turned), plain[:, [3, 2, 1, 0, 4]], atol=1e-4)
-    assert not np.allclose(probs(flipped, policy.brain),
-                           probs(now, policy.brain)[:, [0, 1, 3, 2, 4]], atol=1e-3)
-    with pytest.raises(InputError, match="not of kind entity"):
-        dataclasses.replace(policy, brain=learned.RecurrentBrain(None)).symmetrised()

@@ -49,8 +49,8 @@ class Args:
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()
     """argmax, plain-argmax (without the deadlock watch), sample, best-of-K such as best-of-16;
-    @T sets the temperature of drawing (sample@0.25), -sym averages over the turns and
-    reflections of the map (argmax-sym); again for more rows. Default: argmax."""
+    @T sets the temperature of drawing (sample@0.25); again for more rows.
+    Default: argmax."""
     alone: bool = False
     """Policies play one scenario at a time, not in batches: the planning time of a mission."""
     alpha: float = 1.0

@@ -39,8 +39,8 @@ class Args:
     preference: Many[tuple[float, ...]] = ()
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()
-    """argmax, plain-argmax (without the deadlock watch) or sample, with -sym and @T as in
-    `evaluate grid`; again for more rows. Default: argmax."""
+    """argmax, plain-argmax (without the deadlock watch) or sample, with @T as in `evaluate grid`;
+    again for more rows. Default: argmax."""
     new: int = 5
     """How many of a scenario's targets appear later."""
     count: int = 200

@@ -92,14 +92,14 @@ def _row(name: str, policy: Path, args: Args) -> dict:
     """One set: the figures of three ways to use the policy, side by side."""
     from moonteam.commands.evaluate_grid import load_set, options_of
     from moonteam.evaluation import grid
-    from moonteam.evaluation.contenders import contenders
+    from moonteam.evaluation.contenders import called, contenders
 
     asked = SimpleNamespace(planner=("policy",), objective=(), policy=(str(policy),),
                             time_limit=None, seed=args.seed)
     found = load_set(name, args.limit)
     label = Path(name).stem
     if len(args.policy) > 1:
-        label += f", {policy.parent.name if policy.stem == 'policy' else policy.stem}"
+        label += f", {called(policy)}"
     row: dict = {"planner": label, "scenarios": len(found), "intervals": {}}
     for suffix, wish, decode in (("", 0.0, "argmax"), ("_effort", 1.0, "argmax"),
                                  ("_best", 0.0, f"best-of-{args.best_of}")):

@@ -241,6 +241,11 @@ def contenders(options: Options) -> list[Contender]:
     return found
 
 
+def called(path: Path) -> str:
+    """What a policy file is called: its run's folder, where it is a run's own."""
+    return path.absolute().parent.name if path.stem == "policy" else path.stem
+
+
 def _known() -> str:
     return ", ".join([*PLANNERS, "policy"])
 
@@ -256,12 +261,10 @@ def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contend
     policies = [Policy.load(path) for path in options.policies]
     found: list[Contender] = []
     for path, policy in zip(options.policies, policies, strict=True):
-        stem = "policy" if len(policies) == 1 else path.stem
+        stem = "policy" if len(policies) == 1 else called(path)
         given = options.preferences if isinstance(policy.brain, EntityBrain) else ()
         for preference in given or (0.0,):
             for decode in decodes:
-                if decode.symmetric:
-                    policy.symmetrised()
                 for objective in objectives if decode.rollouts > 1 and objectives else [None]:
                     words = [decode.name]
                     if objective and len(objectives) > 1:

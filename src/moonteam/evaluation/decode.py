@@ -9,11 +9,10 @@ from moonteam.errors import InputError
 from moonteam.planners.base import SAMPLING
 
 MOST_ROLLOUTS = 4096
-ALLOWED = ("argmax, plain-argmax, sample or best-of-K (such as best-of-16); -sym after it "
-           "averages over symmetries, @T sets the temperature of drawing (such as sample@0.25)")
+ALLOWED = ("argmax, plain-argmax, sample or best-of-K (such as best-of-16); @T after it "
+           "sets the temperature of drawing (such as sample@0.25)")
 
-_FORM = re.compile(r"(?P<how>argmax|plain-argmax|sample|best-of-(?P<count>[^@]*?))"
-                   r"(?P<sym>-sym)?(@(?P<heat>.*))?")
+_FORM = re.compile(r"(?P<how>argmax|plain-argmax|sample|best-of-(?P<count>[^@]*))(@(?P<heat>.*))?")
 
 
 @dataclass(frozen=True)
@@ -23,14 +22,12 @@ class Decode:
     `sample` draws the actions; `watch` takes the likeliest but draws where the team comes back
     to a joint state without having solved a target in between, as
     `planners.learned.LearnedPlanner` does; of `rollouts` tries a scenario the best counts.
-    `symmetric` averages the probabilities over the turns and reflections of the map.
     """
 
     name: str
     sample: bool = False
     watch: bool = False
     rollouts: int = 1
-    symmetric: bool = False
     temperature: float = 1.0
 
 
@@ -52,8 +49,8 @@ def parse(text: str) -> Decode:
     sample = count is not None or how == "sample"
     usual = SAMPLING if sample else 1.0
     heat = usual if found["heat"] is None else _temperature(text, found["heat"])
-    name = how + (found["sym"] or "") + ("" if heat == usual else f"@{heat:g}")
-    return Decode(name, sample, how == "argmax", rollouts, found["sym"] is not None, heat)
+    name = how + ("" if heat == usual else f"@{heat:g}")
+    return Decode(name, sample, how == "argmax", rollouts, heat)
 
 
 def _temperature(text: str, heat: str) -> float:

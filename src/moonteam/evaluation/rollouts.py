@@ -290,8 +290,6 @@ def run(policy: Policy, world: World, decode: Decode, preference: float, seed: i
       prices: of a step and a move; a try that costs more than a finished one is given up.
       alone: one scenario after the other, as a single mission would be planned.
     """
-    if decode.symmetric:
-        policy = policy.symmetrised()
     rollouts, count = decode.rollouts, len(world)
     size = rollouts if alone else _places(world, count * rollouts)
     player = Player(world.config, policy.brain, decode.sample, decode.watch, world.longest)

@@ -27,7 +27,7 @@ from moonteam.planners import simulate
 from moonteam.planners.base import SAMPLING, IntArray, Objective, Plan, Snapshot
 from moonteam.planners.routes import Certificate, infeasible, plan_of_trace
 from moonteam.planners.travel import UNREACHABLE, distance_fields
-from moonteam.policies import checkpoint, entity, recurrent, symmetry
+from moonteam.policies import checkpoint, entity, recurrent
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.recurrent import RecurrentSpec
 
@@ -116,8 +116,6 @@ class EntityBrain:
     """The network for any team, any targets, any ground; it has no memory."""
 
     spec: EntitySpec
-    symmetric: bool = False
-    """Average the probabilities over the 8 turns and reflections of the map."""
     travels = True
 
     def slots(self, num_targets: int) -> int:
@@ -137,8 +135,6 @@ class EntityBrain:
             return entity.look(state, horizon, preference, fields)
 
         view = jax.vmap(look)(states, horizon, preference, fields)
-        if self.symmetric:
-            return memory, symmetry.averaged(params, self.spec, view)
         return memory, entity.decide(params, self.spec, view).log_probs
 
     def misfit(self, snapshot: Snapshot) -> str:
@@ -182,16 +178,6 @@ class Policy:
         problem = self.brain.misfit(snapshot)
         if problem:
             raise InputError(self.path, problem)
-
-    def symmetrised(self) -> Policy:
-        """The policy that averages over turns and reflections of the map; 8 times the work.
-
-        Raises InputError if its network sees absolute positions.
-        """
-        if not isinstance(self.brain, EntityBrain):
-            raise InputError(self.path, "is not of kind entity: it cannot be averaged over "
-                             "symmetries")
-        return replace(self, brain=replace(self.brain, symmetric=True))
 
 
 class LearnedPlanner:
