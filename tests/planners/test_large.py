@@ -60,6 +60,12 @@ def test_an_iteration_budget_makes_it_repeatable():
     assert np.array_equal(one.actions, two.actions)
 
 
+def test_no_iterations_are_the_greedy_plan():
+    snapshot = Snapshot.start(grid.generate(1, num_agents=5, num_targets=20))
+    plans = [LnsPlanner("moves", iterations=0).plan(snapshot), GreedyPlanner("moves").plan(snapshot)]
+    np.testing.assert_array_equal(plans[0].actions, plans[1].actions)
+
+
 def test_a_time_limit_stops_it():
     snapshot = Snapshot.start(grid.generate(1, num_agents=5, num_targets=20))
     plan = LnsPlanner("moves", time_limit=0.05).plan(snapshot)

@@ -118,7 +118,7 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
     now, best = events.copy(), events.copy()
     began, done = time.perf_counter(), 0
     cooling = math.log(_COLD / _HOT)
-    while len(task.targets) > 1:
+    while len(task.targets) > 1 and iterations != 0:
         clock = time.perf_counter()
         shares = [done / iterations] if iterations is not None else []
         if until is not None:
