@@ -16,12 +16,14 @@ from training import config as configs
 from training.config import Config
 
 if TYPE_CHECKING:
-    from training import imitate, refine
+    from training import compare, imitate, refine
 
 IMITATION = ("quick", "any_team")
 """Presets that imitate the exact planner; see `training.imitate`."""
 REFINE = "refine"
 """MAPPO from an imitated policy; see `training.refine`."""
+COMPARE = "compare"
+"""Runs side by side; see `training.compare`."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Args:
 
     The presets quick and any_team imitate the exact planner instead, for teams of any size, and
     refine goes on from there by MAPPO; they have options of their own: moonteam train quick --help.
+    compare puts runs side by side: moonteam train compare --help.
 
     The first word after `train` is the preset; every number of it can be changed by an option.
 
@@ -60,7 +63,7 @@ class Args:
     """One JSON document on standard output: the report, or the dry run's table."""
 
 
-def parse(words: list[str]) -> Args | imitate.Args | refine.Args:
+def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
     """Arguments of the command; the preset's numbers are the defaults of all options.
 
     Raises InputError for a preset that does not exist.
@@ -73,6 +76,10 @@ def parse(words: list[str]) -> Args | imitate.Args | refine.Args:
         from training import refine
 
         return refine.parse(words[1:])
+    if words and words[0] == COMPARE:
+        from training import compare
+
+        return compare.parse(words[1:])
     named = bool(words) and not words[0].startswith("-")
     asks_help = any(word in ("-h", "--help") for word in words)
     if not named and not asks_help:
@@ -83,14 +90,16 @@ def parse(words: list[str]) -> Args | imitate.Args | refine.Args:
                     args=rest, description=inspect.getdoc(Args))
 
 
-def run(args: Args | imitate.Args | refine.Args) -> int:
-    """Trains, or describes; returns the exit code."""
+def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
+    """Trains, describes or compares; returns the exit code."""
     from moonteam.compilation import enable_cache
 
     enable_cache()
     if not isinstance(args, Args):
-        from training import imitate, refine
+        from training import compare, imitate, refine
 
+        if isinstance(args, compare.Args):
+            return compare.run(args)
         return refine.run(args) if isinstance(args, refine.Args) else imitate.run(args)
     if args.dry_run:
         from training import account

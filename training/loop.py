@@ -235,7 +235,7 @@ class Run:
             "device": describe_device(), "commit": self.commit,
             "scenarios": FINAL_SCENARIOS, **self.evaluate(phase, FINAL_SCENARIOS)}
         self.write_policy(self.out / "policy.safetensors")
-        record.draw_curve(self.out / "curve.png", {f"seed {self.config.seed}": self.metrics.rows})
+        record.draw_curve(self.out / "curve.png", {f"seed {self.config.seed}": [self.metrics.rows]})
         files.write_json(self.out / "report.json", report)
         return report
 

@@ -6,10 +6,15 @@ import itertools
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from moonteam import files
 from training.config import Config
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class Metrics:
@@ -31,7 +36,7 @@ class Metrics:
 def read(path: Path) -> list[dict[str, Any]]:
     """The rows of a metrics file; a half-written last line is left out."""
     rows = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in files.read_text(path).splitlines() if path.exists() else []:
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
@@ -75,30 +80,49 @@ class Progress:
             self.bar.stop()
 
 
-def draw_curve(path: Path, runs: dict[str, list[dict[str, Any]]]) -> None:
-    """Success, makespan and moves over env steps; one line a run, held-out argmax in full."""
+def draw_curve(path: Path, groups: dict[str, list[list[dict[str, Any]]]]) -> None:
+    """Success, makespan and moves over env steps; one colour a group of runs (lists of rows).
+
+    On held-out scenarios: argmax in full, the mean as far as all runs of the group have come,
+    with each run as a thin line and a band from the lowest to the highest; sampled actions
+    dotted. A run on its own also shows how it did while training.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
+    titles = {"success": "success", "makespan": "makespan, steps", "moves": "moves, whole team"}
+    runs = [rows for group in groups.values() for rows in group]
+    switches = {r["env_steps"] for rows in runs for a, r in itertools.pairwise(rows)
+                if a["phase"] != r["phase"]}
     axes = figure.subplots(1, 3)
-    for axis, key in zip(axes, ("success", "makespan", "moves"), strict=True):
-        for index, (name, rows) in enumerate(runs.items()):
-            color = f"C{index}"
-            scored = [row for row in rows if "argmax" in row]
-            axis.plot([r["env_steps"] for r in rows], [r[key] for r in rows], color=color,
-                      alpha=0.3, label=f"{name}, while training")
-            for decode, style in (("argmax", "-"), ("sample", ":")):
-                axis.plot([r["env_steps"] for r in scored], [r[decode][key] for r in scored],
-                          style, color=color, label=f"{name}, held out, {decode}")
-            switch = [r["env_steps"] for a, r in itertools.pairwise(rows)
-                      if a["phase"] != r["phase"]]
-            for x in switch:
-                axis.axvline(x, color="0.7", linewidth=0.8)
+    for axis, key in zip(axes, titles, strict=True):
+        if len(runs) == 1:
+            axis.plot([r["env_steps"] for r in runs[0]], [r[key] for r in runs[0]], color="C0",
+                      alpha=0.3, label="while training")
+        for index, (name, group) in enumerate(groups.items()):
+            _draw_group(axis, key, name, group, f"C{index % 10}")
+        for x in switches:
+            axis.axvline(x, color="0.7", linewidth=0.8)
         axis.set_xlabel("env steps")
-        axis.set_title({"success": "success", "makespan": "makespan, steps",
-                        "moves": "moves, whole team"}[key])
-    axes[0].legend(fontsize=7)
+        axis.set_title(f"{titles[key]}, held out")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, ncols=4,
+                  loc="outside lower center")
     with files.replacing(path) as temporary:
         figure.savefig(temporary, dpi=120)
+
+
+def _draw_group(axis: Axes, key: str, name: str, runs: list[list[dict[str, Any]]],
+                colour: str) -> None:
+    for decode, style in (("argmax", "-"), ("sample", ":")):
+        curves = [{r["env_steps"]: r[decode][key] for r in rows if decode in r} for rows in runs]
+        shared = sorted(set.intersection(*map(set, curves)))
+        table = np.array([[curve[x] for x in shared] for curve in curves])  # [runs, points]
+        axis.plot(shared, table.mean(axis=0), style, color=colour, label=f"{name}, {decode}")
+        if decode == "argmax" and len(runs) > 1:
+            axis.fill_between(shared, table.min(axis=0), table.max(axis=0), color=colour,
+                              alpha=0.15, linewidth=0)
+            for curve in curves:
+                axis.plot(list(curve), list(curve.values()), color=colour, alpha=0.4,
+                          linewidth=0.6)

@@ -132,6 +132,7 @@ def test_killed_and_resumed_is_bit_identical(whole, tmp_path):
     assert same(bits(run), bits(whole))
     for name in ("config.json", "metrics.jsonl", "report.json", "curve.png", "policy.safetensors"):
         assert (tmp_path / name).stat().st_size > 0
+    assert main(["train", "compare", str(tmp_path)]) == 0
 
 
 def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
