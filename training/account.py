@@ -28,6 +28,7 @@ def describe(config: Config) -> dict[str, Any]:
     phases = {name: phase_account(config, phase) for name, phase in config.phases}
     return {
         "config": dataclasses.asdict(config), "phases": phases,
+        "h100": {p: roofline(config, list(phases.values()), p) for p in PEAK_FLOPS},
         "env_steps": sum(row["env_steps"] for row in phases.values()),
         "flops": sum(row["env_steps"] * row["flops_per_env_step"] for row in phases.values()),
         "kernel_parameters": {name: recurrent.kernel_count(tree) for name, tree in params.items()}
@@ -83,6 +84,31 @@ ACTIVATIONS = 20
 """Width-sized float32 arrays a row that the gradient of one network keeps or makes: embedding
 (2), gates (3), recurrent products (3), r, z, n, output (4), mix (2), and the gradients of the
 largest three of these (6)."""
+
+
+PEAK_FLOPS = {"float32": 66.9e12, "tf32": 494.7e12, "bfloat16": 989.4e12}
+"""Dense matrix products of an H100 SXM, operations a second, from its data sheet."""
+BANDWIDTH = 3.35e12
+"""Of its memory, bytes a second, from the same."""
+LAUNCH_S, KERNELS = 3e-6, 12
+"""What a kernel launched in a loop costs at least, and how many a recurrent step of both networks
+takes, forth (2 each) and back (4 each): assumed, not measured."""
+
+
+def roofline(config: Config, phases: list[dict[str, Any]], precision: str) -> dict[str, float]:
+    """Seconds that a whole run cannot be under on an H100 SXM, part by part; an estimate.
+
+    compute: matrix products at the data sheet's peak. traffic: each minibatch with its
+    activations written and read once. launches: of the recurrent steps of every gradient step,
+    which follow one another.
+    """
+    steps = sum(row["gradient_steps"] for row in phases)
+    return {
+        "compute": sum(row["env_steps"] * row["flops_per_env_step"] for row in phases)
+        / PEAK_FLOPS[precision],
+        "traffic": sum(row["gradient_steps"] * 2 * row["memory_bytes"]["minibatch"]
+                       for row in phases) / BANDWIDTH,
+        "launches": steps * config.num_steps * KERNELS * LAUNCH_S}
 
 
 def _bytes(tree: Any) -> int:
@@ -146,4 +172,8 @@ def _totals(config: Config, table: dict[str, Any]) -> list[str]:
         f"env steps: {table['env_steps']:,} ({table['env_steps']:.4g})",
         f"kernel parameters: actor {kernels['actor']:,} + critic {kernels['critic']:,} = "
         f"{kernels['total']:,}; all parameters {table['parameters']:,}",
-        f"floating-point operations: {work / 1e6:.1f} M an env step, {table['flops']:.3g} in all"]
+        f"floating-point operations: {work / 1e6:.1f} M an env step, {table['flops']:.3g} in all",
+        *(f"H100 SXM, {precision}, estimated and not measured: {parts['compute'] / 60:.1f} min of "
+          f"products at peak, {parts['traffic'] / 60:.1f} of memory traffic, "
+          f"{parts['launches'] / 60:.1f} of kernel launches" for precision, parts
+          in table["h100"].items())]

@@ -36,6 +36,10 @@ def test_dry_run_of_pi_5t(capsys):
     refinement = table["phases"]["refinement"]
     assert refinement["flops_per_env_step"] == 2 * 244_992 * 3 * 13
     assert refinement["memory_bytes"]["total"] < 20 * 2**30
+    assert table["h100"]["tf32"]["compute"] == pytest.approx(
+        table["env_steps"] * refinement["flops_per_env_step"] / 494.7e12)
+    launched = (572 * 16 + 1271 * 32) * 4 * 128
+    assert table["h100"]["float32"]["launches"] == pytest.approx(launched * 12 * 3e-6)
     assert table["config"]["refinement"]["weights"]["SC"] == 0.3
     assert table["config"]["bootstrap"]["weights"] == {
         "AR": 1.0, "TR": 1.0, "WC": 0.25, "SC": 0.0, "TC": 0.0, "TB": 0.0}
