@@ -31,8 +31,8 @@ class Args:
     - noise: m, error of the positions that the executor sees and steers by.
     - delay: s, until a command reaches the controllers.
 
-    Files in --out: report.html and curves.png, report.json, and rows.jsonl, to which each mission
-    is added as it ends, so that --resume can go on.
+    Files in --out: report.html, curves.png, table.md, report.json, and rows.jsonl, to which each
+    mission is added as it ends, so that --resume can go on.
 
     Examples:
       moonteam evaluate sensitivity --out runs/sensitivity
@@ -73,6 +73,8 @@ class Args:
     """Go on with the run in --out; the options must be the same."""
     json: bool = False
     """Print the report as one JSON document and nothing else."""
+    markdown: bool = False
+    """Print the table as Markdown and nothing else."""
     out: Path | None = None
     """Output folder."""
 
@@ -84,6 +86,7 @@ def run(args: Args) -> int:
 
     enable_cache()
     call_at_once()
+    from moonteam.evaluation.report import print_plain
     from sim2grid.evaluate import Contender, contenders, maker
     from sim2grid.fleet import Recipe
     from sim2grid.sensitivity import run_setting, settings
@@ -114,14 +117,11 @@ def run(args: Args) -> int:
         report["interrupted"] = True
     if args.out:
         _save(args.out, report)
-    if args.json:
-        print(files.dump_json(report))
-    else:
-        _show(report)
+    print_plain(args, report, [_table(report)])
     return journal.interrupted(args.out) if interrupted else 0
 
 
-_NOT_REPEATED = ("json", "out", "resume")
+_NOT_REPEATED = ("json", "markdown", "out", "resume")
 """Options on which the report does not depend."""
 
 
@@ -181,26 +181,42 @@ def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: li
         for quantity in args.quantity for name in names]
     return {"kind": "sensitivity", "title": "sensitivity of executions",
             "meta": provenance.meta(command, args.seed), "options": _options(args),
-            "curves": curves,
+            "curves": curves, "notes": NOTES,
             "rows": [{"setting": key} | msgspec.to_builtins(row)
                      for key, found in rows.items() for _, row in sorted(found.items())]}
 
 
 def _save(out: Path, report: dict[str, Any]) -> None:
+    from moonteam.evaluation.report import plain_markdown
     from sim2grid.sensitivity_page import curves_figure, sensitivity_page
 
     files.write_json(out / "report.json", report)
     files.write_text(out / "report.html", sensitivity_page(report))
+    files.write_text(out / "table.md", plain_markdown(report, [_table(report)]) + "\n")
     with files.replacing(out / "curves.png") as temporary:
         figure = curves_figure(report)
         figure.savefig(temporary, dpi=130, facecolor=figure.get_facecolor())
 
 
-def _show(report: dict[str, Any]) -> None:
-    """The points, for a person."""
+NOTES = ["In brackets: 95 % intervals, of success by Wilson, of seconds by bootstrap over the "
+         "missions that succeeded."]
+
+
+def _table(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """A row for each value and contender."""
+    rows = []
     for curve in report["curves"]:
-        print(f"{curve['label']} ({curve['contender']})")
         for at in curve["points"]:
-            print(f"  {at['value']:>6g}  " + (at["impossible"] or (
-                f"{at['solved']} of {at['missions']} missions"
-                + ("" if at["seconds"] is None else f", {at['seconds']:.1f} s"))))
+            causes = "; ".join(f"{cause}: {len(found)}" for cause, found in at["failures"].items())
+            rows.append([curve["label"], f"{at['value']:g}", curve["contender"],
+                         at["impossible"] or f"{at['solved']} of {at['missions']}",
+                         _spread(at, "success", 2), _spread(at, "seconds", 1), causes or "-"])
+    return ["quantity", "value", "contender", "solved", "success", "seconds", "failed"], rows
+
+
+def _spread(at: dict[str, Any], key: str, digits: int) -> str:
+    """A figure with its interval in brackets."""
+    if at[key] is None:
+        return "-"
+    low, high = at["intervals"][key]
+    return f"{at[key]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

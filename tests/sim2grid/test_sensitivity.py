@@ -176,7 +176,11 @@ def test_the_command_draws_its_curves_and_goes_on_where_it_was(tmp_path, capsys,
     assert points[1]["seconds"] >= points[0]["seconds"]
     assert [row["setting"] for row in report["rows"]] == ["usual", "delay 0.4"]
     assert {p.name for p in out.iterdir()} == {
-        "config.json", "report.json", "report.html", "curves.png", "rows.jsonl"}
+        "config.json", "report.json", "report.html", "curves.png", "rows.jsonl", "table.md"}
+    usual, late = points
+    assert (f"| delay, s | 0.4 | {report['curves'][1]['contender']} | {late['solved']} of 1 | "
+            in (out / "table.md").read_text())
+    assert usual["solved"] == 1
     lines = (out / "rows.jsonl").read_text().splitlines(keepends=True)
     (out / "rows.jsonl").write_text(lines[0] + lines[1][:40])
     assert main([*words, "--resume"]) == 0
