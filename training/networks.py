@@ -34,6 +34,9 @@ class Networks:
     critic: Recurrent
     scale: tuple[float, ...]  # [D] from raw observations to network input
     num_agents: int
+    shared_value: bool = False
+    """The critic reads all observations in the agents' order, the same for each agent: it runs
+    once for the team, and its memory is [E, 1, H]. Otherwise each agent's own comes first."""
 
     def init(self, key: Array) -> Pair:
         """Fresh parameters."""
@@ -52,8 +55,10 @@ class Networks:
 
     def empty(self, num_envs: int) -> Pair:
         """Memory at the start, each [E, N, H]."""
-        shape = (num_envs, self.num_agents, self.width)
-        return Pair(jnp.zeros(shape), jnp.zeros(shape))  # two buffers: each can be donated
+        critics = 1 if self.shared_value else self.num_agents
+        # two buffers: each can be donated
+        return Pair(jnp.zeros((num_envs, self.num_agents, self.width)),
+                    jnp.zeros((num_envs, critics, self.width)))
 
     def inputs(self, obs: Array) -> Array:
         """Raw observations [..., D] -> network input, float32."""
@@ -65,10 +70,16 @@ class Networks:
         return _apply(self.actor, params, hidden, self.inputs(obs), reset)
 
     def values(self, params: dict, hidden: Array, obs: Array, reset: Array) -> tuple[Array, Array]:
-        """hidden [E, N, H], obs [T, E, N, D], reset [T, E] -> (hidden, [T, E, N])."""
-        everyone = recurrent.own_first(self.inputs(obs))
+        """hidden [E, N, H] or shared [E, 1, H], obs [T, E, N, D], reset [T, E] -> (hidden,
+        [T, E, N]).
+        """
+        inputs = self.inputs(obs)
+        if self.shared_value:
+            everyone = inputs.reshape(*inputs.shape[:2], 1, -1)
+        else:
+            everyone = recurrent.own_first(inputs)
         hidden, values = _apply(self.critic, params, hidden, everyone, reset)
-        return hidden, values[..., 0]
+        return hidden, jnp.broadcast_to(values[..., 0], obs.shape[:-1])
 
 
 def _apply(net: Recurrent, params: dict, hidden: Array, inputs: Array,

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from training import sharding
 from training.networks import Networks, Pair
 from training.task import EnvState, Task
 
@@ -72,7 +73,7 @@ class Rollout(NamedTuple):
 class _Walk(NamedTuple):
     carry: Carry
     cut: Cut
-    tally: Tally
+    tally: Tally  # of each environment, [E]
 
 
 def begin(networks: Networks, task: Task, key: Array, num_envs: int) -> Carry:
@@ -95,16 +96,18 @@ def collect(networks: Networks, task: Task, params: Pair, carry: Carry, key: Arr
     num_envs = carry.reset_before.shape[0]
     pool_key, walk_key = jax.random.split(key)
     pool = task.reset(pool_key, num_envs)
-    starts = (pool, task.observe(pool))
+    # Dealt out across devices: fetched once, not at every step.
+    starts = sharding.whole(sharding.along((pool, task.observe(pool)), 0))
 
     def step(walk: _Walk, t: Array) -> tuple[_Walk, Transition]:
         return _step(networks, task, params, walk, starts, jax.random.fold_in(walk_key, t), t)
 
-    zero = jnp.zeros((), jnp.int32)
+    zero = jnp.zeros(num_envs, jnp.int32)
     walk = _Walk(carry, Cut(carry.obs, carry.memory.critic), Tally(zero, zero, zero, zero))
     walk, steps = jax.lax.scan(step, walk, jnp.arange(num_steps))
     last_value, cut_value = _following_values(networks, params, walk)
-    return walk.carry, Rollout(carry.memory, steps, last_value, cut_value, walk.tally)
+    tally = jax.tree.map(jnp.sum, walk.tally)
+    return walk.carry, Rollout(carry.memory, steps, last_value, cut_value, tally)
 
 
 def _step(networks: Networks, task: Task, params: Pair, walk: _Walk, starts: tuple[EnvState, Array],
@@ -123,7 +126,7 @@ def _step(networks: Networks, task: Task, params: Pair, walk: _Walk, starts: tup
     state, obs_next = choose(ended, (fresh, fresh_obs), (out.state, final_obs))
     following = Carry(state, obs_next, ended, Pair(actor_memory, critic_memory))
     cut = choose(out.truncated, Cut(final_obs, critic_memory), walk.cut)
-    tally = Tally(*(total + jnp.sum(new) for total, new in zip(walk.tally, (
+    tally = Tally(*(total + new for total, new in zip(walk.tally, (
         ended, out.terminated, jnp.where(ended, out.steps, 0), jnp.where(ended, out.moves, 0)),
         strict=True)))
     transition = Transition(

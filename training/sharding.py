@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -71,6 +72,37 @@ def spread(mesh: Mesh, tree: Any) -> Any:
 def everywhere(mesh: Mesh, tree: Any) -> Any:
     """Every leaf whole on each device."""
     return _put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+@contextmanager
+def mesh_of(array: jax.Array) -> Iterator[None]:
+    """The devices that `array` is spread over, known to `along` and `whole` inside."""
+    found = array.sharding
+    if not isinstance(found, NamedSharding):
+        yield
+        return
+    with jax.set_mesh(found.mesh):
+        yield
+
+
+def along(tree: Any, axis: int) -> Any:
+    """Under jit: shares out this axis of every leaf over the devices of `mesh_of`.
+
+    XLA cannot be left to find out: rows picked at random from a batch that is spread are
+    gathered whole, and from there on every device would do the same work.
+    """
+    return _constrained(tree, PartitionSpec(*[None] * axis, "batch"))
+
+
+def whole(tree: Any) -> Any:
+    """Under jit: every leaf whole on each device of `mesh_of`."""
+    return _constrained(tree, PartitionSpec())
+
+
+def _constrained(tree: Any, spec: PartitionSpec) -> Any:
+    if jax.sharding.get_abstract_mesh().empty:
+        return tree
+    return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, spec), tree)
 
 
 def _put(tree: Any, sharding: NamedSharding) -> Any:

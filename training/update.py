@@ -14,7 +14,7 @@ import optax
 from jax import Array
 from jax.typing import ArrayLike
 
-from training import gae, losses, rollout
+from training import gae, losses, rollout, sharding
 from training.hyper import Hyper
 from training.losses import ActorReport, Minibatch
 from training.networks import Networks, Pair
@@ -83,9 +83,10 @@ def order(key: Array, num_envs: int, count: int) -> Array:
 
 
 def minibatch(batch: Rollout, advantage: Array, target: Array, index: Array) -> Minibatch:
-    """The whole sequences of the environments `index`."""
+    """The whole sequences of the environments `index`, shared out over the devices."""
     sequences = jax.tree.map(lambda x: x[:, index], (batch.steps, advantage, target))
-    return Minibatch(jax.tree.map(lambda x: x[index], batch.before), *sequences)
+    memory = jax.tree.map(lambda x: x[index], batch.before)
+    return Minibatch(sharding.along(memory, 0), *sharding.along(sequences, 1))
 
 
 def descend(networks: Networks, hyper: Hyper, params: Pair, state: Pair,
@@ -128,14 +129,24 @@ def update(networks: Networks, task: Task, hyper: Hyper,
     carry, batch = rollout.collect(networks, task, learner.params, learner.carry, collect_key,
                                    hyper.num_steps)
     params, state, (report, value_loss) = improve(networks, hyper, learner, batch, improve_key)
-    learner = Learner(params, state, carry, key, learner.update + 1)
+    params, state = sharding.whole((params, state))
+    learner = Learner(params, state, sharding.along(carry, 0), key, learner.update + 1)
     return learner, Report(report, value_loss, batch.steps.reward.mean(), batch.tally)
 
 
-@partial(jax.jit, static_argnames=("networks", "task", "hyper", "count"), donate_argnames="learner")
 def chunk(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
           count: int) -> tuple[Learner, Report]:
-    """`count` updates in one call; the report's leaves are [count]."""
+    """`count` updates in one call, on the devices that the learner is spread over.
+
+    The learner is donated; the report's leaves are [count].
+    """
+    with sharding.mesh_of(learner.carry.reset_before):
+        return _chunk(networks, task, hyper, learner, count)
+
+
+@partial(jax.jit, static_argnames=("networks", "task", "hyper", "count"), donate_argnames="learner")
+def _chunk(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
+           count: int) -> tuple[Learner, Report]:
     def body(learner: Learner, _: None) -> tuple[Learner, Report]:
         return update(networks, task, hyper, learner)
 
