@@ -71,14 +71,19 @@ def checksums(learner: Path) -> dict[str, int]:
     return {p.relative_to(learner).as_posix(): zlib.crc32(p.read_bytes()) for p in names}
 
 
-def save(folder: Path, learner: Learner, about: About) -> Path:
-    """Writes one checkpoint and drops all but the newest few. Raises InputError if it cannot.
+def place_of(folder: Path, total_updates: int) -> Path:
+    """Where the checkpoint after so many updates is, or would be."""
+    return folder / f"{total_updates:08d}"
 
-    `learner` holds host arrays, its key as raw words.
+
+def save(folder: Path, learner: Learner, about: About, keep: int | None = None) -> Path:
+    """Writes one checkpoint; drops all but the newest few and that after `keep` updates.
+
+    `learner` holds host arrays, its key as raw words. Raises InputError if it cannot be written.
     """
     import orbax.checkpoint as ocp  # seconds to import, and only training needs it
 
-    place = folder / f"{about.total_updates:08d}"
+    place = place_of(folder, about.total_updates)
     arrays = flatten(learner)
     partial = None
     try:
@@ -99,7 +104,8 @@ def save(folder: Path, learner: Learner, about: About) -> Path:
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
     for old in _all(folder)[:-KEEP]:
-        shutil.rmtree(old, ignore_errors=True)
+        if keep is None or old != place_of(folder, keep):
+            shutil.rmtree(old, ignore_errors=True)
     return place
 
 

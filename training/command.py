@@ -51,6 +51,9 @@ class Args:
     """Go on with the run in the folder."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints; a chunk of updates is never cut."""
+    stop_on_collapse: bool = True
+    """Stop, with exit code 1, when held-out success has fallen to half of its best for three
+    evaluations in a row."""
     coordinator: str = ""
     """host:port of process 0, to train on several hosts; each runs this command."""
     processes: int = 1
@@ -119,7 +122,7 @@ def _train(args: Args) -> int:
     if args.coordinator:
         sharding.join(args.coordinator, args.processes, args.process)
         out = out / f"process-{args.process}" if args.process else out
-    run = loop.Run(config, out, args.resume, args.checkpoint_seconds)
+    run = loop.Run(config, out, args.resume, args.checkpoint_seconds, args.stop_on_collapse)
     say = sys.stderr if args.json else sys.stdout
     try:
         with loop.stop_on_signals() as stop:

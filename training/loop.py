@@ -36,7 +36,9 @@ FINAL_SCENARIOS = 500
 
 
 class Diverged(Exception):
-    """Training produced something that is not a number; says which checkpoint is good."""
+    """Training produced something that is not a number, or a policy that lost what it could;
+    says which checkpoint is good.
+    """
 
 
 @dataclass
@@ -83,9 +85,11 @@ class Run:
     `report.json` and `curve.png`.
     """
 
-    def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0):
+    def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0,
+                 stop_on_collapse: bool = True):
         """Raises InputError if the folder holds a run that this one may not go on with."""
         self.config, self.out, self.checkpoint_seconds = config, out, checkpoint_seconds
+        self.stop_on_collapse = stop_on_collapse
         # Of the code that is loaded now, whatever is checked out later.
         self.commit = commit() or "unknown"
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
@@ -178,8 +182,12 @@ class Run:
             if enough or anywhere(stop.asked):
                 return False
             count = min(self.config.chunk_updates, phase.updates - self.position.update)
-            progress.show(self._chunk(phase, count))
-            if anywhere(time.monotonic() - self.last_saved > self.checkpoint_seconds):
+            row = self._chunk(phase, count)
+            progress.show(row)
+            if self.stop_on_collapse:
+                self._check_standing()
+            due = time.monotonic() - self.last_saved > self.checkpoint_seconds
+            if anywhere(due or row is record.best(self.metrics.rows)):
                 self.save()
         return True
 
@@ -192,7 +200,7 @@ class Run:
                                             self.learner, count)
         report = gather(report)
         seconds = time.monotonic() - begun
-        _check_finite(report, position, self.last_good)
+        _check_finite((report, gather(self.learner.params)), position, self.last_good)
         steps = count * phase.num_envs * config.num_steps
         position.update += count
         position.total_updates += count
@@ -204,6 +212,21 @@ class Run:
             row |= self.evaluate(phase, config.eval_scenarios)
         self.metrics.add(row)
         return row
+
+    def _check_standing(self) -> None:
+        """Raises Diverged if the policy has lost what it could; see `record.collapsed`."""
+        rows, position = self.metrics.rows, self.position
+        if "sample" not in rows[-1] or not record.collapsed(rows, self.config.eval_scenarios):
+            return
+        best = record.best(rows)
+        assert best is not None
+        place = checkpoints.place_of(self.folder, best["total_updates"])
+        good = f"the last good checkpoint is {place}" if place.exists() else "no checkpoint is left"
+        raise Diverged(
+            f"training collapsed by update {position.total_updates} ({position.phase}): sampled "
+            f"actions solve {rows[-1]['sample']['success']:.3f} of the held-out scenarios, after "
+            f"update {best['total_updates']} it was {best['sample']['success']:.3f}; {good} "
+            "(--no-stop-on-collapse goes on regardless)")
 
     def evaluate(self, phase: Phase, scenarios: int) -> dict[str, dict[str, float]]:
         """Held-out scores, argmax and sampled."""
@@ -222,7 +245,9 @@ class Run:
             spec = dataclasses.asdict(self.config.spec)
             about = About(**dataclasses.asdict(self.position), files={}, network=spec)
             whole = gather(self.learner._replace(key=jax.random.key_data(self.learner.key)))
-            self.last_good = checkpoints.save(self.folder, whole, about)
+            best = record.best(self.metrics.rows)
+            self.last_good = checkpoints.save(self.folder, whole, about,
+                                              best and best["total_updates"])
         self.last_saved = time.monotonic()
 
     def finish(self) -> dict[str, Any]:
@@ -259,12 +284,13 @@ def _summary(report: Report) -> dict[str, float]:
                   "mean_reward": float(report.mean_reward.mean())}
 
 
-def _check_finite(report: Report, position: Position, last_good: Path | None) -> None:
-    for leaf in jax.tree.leaves(report):
+def _check_finite(tree: Any, position: Position, last_good: Path | None) -> None:
+    """The weights too: the last step of a chunk can spoil them after its loss was taken."""
+    for leaf in jax.tree.leaves(tree):
         if not np.isfinite(leaf).all():
             good = f"the last good checkpoint is {last_good}" if last_good else "none was saved yet"
             raise Diverged(f"training diverged after update {position.total_updates} "
-                           f"({position.phase}): a loss is not a number; {good}")
+                           f"({position.phase}): a loss or weight is not a number; {good}")
 
 
 def describe_device() -> str:

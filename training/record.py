@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,37 @@ def read(path: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return rows
+
+
+STANDING = 0.5
+"""Success from which on a policy counts as one that can be lost."""
+PATIENCE = 3
+"""Evaluations in a row that must show the fall."""
+
+
+def best(rows: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The row of the best evaluation so far, by success of sampled actions; the last of equals."""
+    looks = [row for row in rows if "sample" in row]
+    return max(reversed(looks), key=lambda row: row["sample"]["success"], default=None)
+
+
+def collapsed(rows: list[dict[str, Any]], scenarios: int) -> bool:
+    """Whether a policy that could do something has lost it, and not for a moment.
+
+    True when the best evaluation solved at least half of the scenarios, and each of the last
+    three at most half as many as it, the fall being more than chance explains: four standard
+    errors of the difference of two shares of `scenarios`. Sampled actions count, since argmax
+    also fails by robots that wait for each other, which comes and goes while all is well. The
+    phases are one: they set the same scenarios. A fresh optimiser and new rewards may cost a
+    policy something at the start of a phase, which is why one low evaluation is not enough.
+    """
+    top = best(rows)
+    if top is None or top["sample"]["success"] < STANDING:
+        return False
+    success = top["sample"]["success"]
+    low = min(success / 2, success - 4 * math.sqrt(0.5 / scenarios))
+    last = [row["sample"]["success"] for row in rows if "sample" in row][-PATIENCE:]
+    return len(last) == PATIENCE and max(last) <= low
 
 
 class Progress:

@@ -14,7 +14,8 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
-from training import checkpoints, loop
+from moonteam.grid import env
+from training import checkpoints, loop, record
 from training.config import BOOTSTRAP, REFINEMENT, Config, Phase
 from training.loop import Run, Stop
 
@@ -109,7 +110,7 @@ def test_a_torn_checkpoint_is_passed_over_with_a_warning(whole, tmp_path, harm):
         (newest / "about.json").write_text('{"phase": "refi')
     with pytest.warns(UserWarning, match="00000006 is torn"):
         run = Run(TINY, tmp_path, resume=True)
-    assert run.position.total_updates == 2
+    assert run.position.total_updates == 4  # saved for its evaluation, the best until then
     assert run.train(Stop())
     assert same(bits(run), bits(whole))
 
@@ -163,6 +164,106 @@ def test_not_a_number_names_the_last_good_checkpoint(tmp_path, capsys):
     with pytest.raises(loop.Diverged, match=r"not a number; .*checkpoints/00000002"):
         run.train(Stop())
     assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def test_weights_spoiled_by_a_chunks_last_step_are_not_saved_as_good(tmp_path, monkeypatch):
+    run = stopped(tmp_path, 2)
+    real = loop.update.chunk
+
+    def spoiled(*args):
+        learner, report = real(*args)
+        return learner._replace(params=jax.tree.map(lambda x: x * np.nan, learner.params)), report
+
+    monkeypatch.setattr(loop.update, "chunk", spoiled)
+    with pytest.raises(loop.Diverged, match="weight is not a number"):
+        run.train(Stop())
+    assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def looks(*successes):
+    """Rows with evaluations of sampled actions, one every ten updates."""
+    return [{"total_updates": 10 * i, "sample": {"success": s}} for i, s in enumerate(successes, 1)]
+
+
+SMALL = looks(.633, .645, .656, .719, .754, .730, .820, .879, .895, .906, .895, .938, .941, .941,
+              .926, .930, .953, .984, .988, .988, .980, .996, .988, .992)
+"""What `moonteam train small --seed 0` shows."""
+
+
+@pytest.mark.parametrize(("successes", "scenarios", "expected"), [
+    ((0.9, 0.45, 0.4, 0.3), 256, True),
+    ((0.6, 0.9, 0.0, 0.0, 0.0), 256, True),
+    ((0.9, 0.9, 0.3, 0.3), 256, False),  # two only
+    ((0.9, 0.3, 0.3, 0.5, 0.3), 256, False),  # not in a row
+    ((0.9, 0.46, 0.4, 0.3), 256, False),  # more than half of the best
+    ((0.45, 0.1, 0.1, 0.1), 256, False),  # never could do much
+    ((0.6, 0.29, 0.29, 0.29), 16, False),  # chance, on so few scenarios
+    ((0.1, 0.1, 0.1, 0.1), 256, False)])
+def test_a_collapse_is_a_lasting_fall_to_half_of_what_it_could(successes, scenarios, expected):
+    assert record.collapsed(looks(*successes), scenarios) is expected
+
+
+def test_no_false_alarm_in_normal_learning():
+    assert not any(record.collapsed(SMALL[:n], 256) for n in range(len(SMALL) + 1))
+    training = [{"total_updates": n} for n in range(3)]
+    assert not record.collapsed(training, 256)
+    draw = np.random.default_rng(0)
+    for scenarios in (4, 8, 16, 32, 256):  # one policy, measured again and again
+        for ability in (0.3, 0.5, 0.7, 0.95):
+            noisy = looks(*(draw.binomial(scenarios, ability, 400) / scenarios))
+            assert not any(record.collapsed(noisy[:n], scenarios) for n in range(1, 401, 3))
+
+
+def test_the_last_of_equally_good_evaluations_is_the_best():
+    assert record.best(looks(0.5, 0.8, 0.8, 0.7))["total_updates"] == 30
+    assert record.best([{"total_updates": 5}]) is None
+
+
+def test_a_lost_policy_stops_the_run_and_the_best_checkpoint_is_left(tmp_path):
+    """In 48 steps robots that walk about at random solve nearly all; then they are made to stay."""
+    easy = dataclasses.replace(
+        TINY, bootstrap=Phase(40, 8, 2, BOOTSTRAP, lr=1e-5), max_steps=48, eval_every=1,
+        eval_scenarios=64, refinement=dataclasses.replace(TINY.refinement, updates=0))
+    run = Run(easy, tmp_path, resume=False, checkpoint_seconds=0)
+    run.train(Stop(), stop_after=4)
+    good = record.best(run.metrics.rows)
+    assert good["sample"]["success"] > 0.6
+    params = run.learner.params
+    lame = jax.tree.map(lambda x: x.at[env.STAY].add(100.0) if x.shape == (env.NUM_ACTIONS,) else x,
+                        params.actor)  # the bias of the logits
+    run.learner = run.learner._replace(params=params._replace(actor=lame))
+    with pytest.raises(loop.Diverged, match=r"collapsed by update 10 .*sampled actions solve 0\.0"):
+        run.train(Stop())
+    before = tmp_path / "checkpoints" / f"{good['total_updates']:08d}"
+    assert before.is_dir()
+    fresh = tmp_path / "fresh"  # to go on from it: a folder that holds nothing else
+    (fresh / "checkpoints").mkdir(parents=True)
+    before.rename(fresh / "checkpoints" / before.name)
+    again = Run(dataclasses.replace(easy, gamma=0.9), fresh, resume=True)
+    assert again.position.total_updates == good["total_updates"]
+
+
+def test_a_collapse_ends_the_command_with_one_unless_told_otherwise(tmp_path, monkeypatch, capsys):
+    scores = iter([0.9, 0.3, 0.2, 0.4, 0.1] * 3)
+
+    def evaluate(self, phase, scenarios):
+        score = {"success": next(scores), "makespan": 8.0, "moves": 9.0}
+        return {"argmax": score, "sample": score}
+
+    monkeypatch.setattr(Run, "evaluate", evaluate)
+    often = ("--eval-every", "1", "--eval-scenarios", "256", "--checkpoint-seconds", "0")
+    assert main(words(tmp_path / "a", *often)) == 1
+    line = capsys.readouterr().err
+    place = tmp_path / "a" / "checkpoints" / "00000002"
+    assert f"after update 2 it was 0.900; the last good checkpoint is {place} (" in line
+    assert line.count("\n") == 1
+    kept = [path.name for path in sorted(place.parent.iterdir())]
+    assert kept == ["00000002", "00000004", "00000006"]
+    scores = iter([0.9, 0.3, 0.2, 0.4, 0.1] * 3)
+    assert main(words(tmp_path / "b", *often, "--no-stop-on-collapse")) == 0
+    assert (tmp_path / "b" / "report.json").exists()
+    kept = [path.name for path in sorted((tmp_path / "b" / "checkpoints").iterdir())]
+    assert kept == ["00000002", "00000006", "00000008", "00000010"]
 
 
 def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
