@@ -136,6 +136,35 @@ def test_killed_and_resumed_is_bit_identical(whole, tmp_path):
     assert main(["train", "compare", str(tmp_path)]) == 0
 
 
+def test_sigterm_while_training_saves_and_the_run_goes_on_from_there(tmp_path):
+    """Checkpoints by the clock are turned off, and so is the one of the best evaluation."""
+    endless = ["--bootstrap.updates", "1000000", "--eval-every", "1000000"]
+    command = [sys.executable, "-m", "moonteam.cli",
+               *words(tmp_path, "--checkpoint-seconds", "1e6", *endless)]
+    child = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"},
+                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    metrics = tmp_path / "metrics.jsonl"
+    deadline = time.monotonic() + 300
+    while len(record.read(metrics)) < 3:
+        assert child.poll() is None, child.communicate()[1].decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert checkpoints.newest(tmp_path / "checkpoints") is None
+    child.send_signal(signal.SIGTERM)
+    line = child.communicate(timeout=300)[1].decode()
+    assert child.returncode == 130, line
+    done = record.read(metrics)[-1]["total_updates"]
+    assert f"interrupted after update {done}, saved; go on with --out {tmp_path} --resume" in line
+    assert checkpoints.newest(tmp_path / "checkpoints").name == f"{done:08d}"
+    config = dataclasses.replace(
+        TINY, eval_every=1000000, bootstrap=dataclasses.replace(TINY.bootstrap, updates=1000000))
+    run = Run(config, tmp_path, resume=True)
+    assert run.position.total_updates == done
+    assert not run.train(Stop(), stop_after=done + 2)
+    updates = [row["total_updates"] for row in record.read(metrics)]
+    assert updates == list(range(2, done + 3, 2))
+
+
 def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     for number in (signal.SIGTERM, signal.SIGINT):
