@@ -51,6 +51,9 @@ class Args:
     """Go on with the run in the folder."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints; a chunk of updates is never cut."""
+    tensorboard: bool = False
+    """Write the metrics as TensorBoard events into the run folder too; needs
+    pip install 'moonteam[tensorboard]'."""
     stop_on_collapse: bool = True
     """Stop, with exit code 1, when held-out success has fallen to half of its best for three
     evaluations in a row."""
@@ -114,15 +117,18 @@ def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
 
 
 def _train(args: Args) -> int:
-    from training import loop, sharding
+    from training import loop, record, sharding
 
     config = args.config
+    if args.tensorboard:
+        record.tensorboard_writer()  # its lack is said before anything is written
     out = args.out or Path("runs") / f"{config.name}-{config.seed}"
     sharding.use_all_cores()
     if args.coordinator:
         sharding.join(args.coordinator, args.processes, args.process)
         out = out / f"process-{args.process}" if args.process else out
-    run = loop.Run(config, out, args.resume, args.checkpoint_seconds, args.stop_on_collapse)
+    run = loop.Run(config, out, args.resume, args.checkpoint_seconds, args.stop_on_collapse,
+                   args.tensorboard)
     say = sys.stderr if args.json else sys.stdout
     try:
         with loop.stop_on_signals() as stop:

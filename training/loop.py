@@ -86,7 +86,7 @@ class Run:
     """
 
     def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0,
-                 stop_on_collapse: bool = True):
+                 stop_on_collapse: bool = True, tensorboard: bool = False):
         """Raises InputError if the folder holds a run that this one may not go on with."""
         self.config, self.out, self.checkpoint_seconds = config, out, checkpoint_seconds
         self.stop_on_collapse = stop_on_collapse
@@ -97,7 +97,8 @@ class Run:
         self.folder = out / "checkpoints"
         self.position, arrays = self._find(resume)
         self.learner = self._resumed(arrays)
-        self.metrics = record.Metrics(out / "metrics.jsonl", self.position.total_updates)
+        self.metrics = record.Metrics(out / "metrics.jsonl", self.position.total_updates,
+                                      tensorboard)
         self.last_saved = time.monotonic()
         self.last_good = checkpoints.newest(self.folder)
 
@@ -169,6 +170,7 @@ class Run:
             return done
         finally:
             progress.stop()
+            self.metrics.close()
 
     def _train_phase(self, index: int, stop: Stop, stop_after: int | None,
                      progress: record.Progress) -> bool:

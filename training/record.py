@@ -12,26 +12,69 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from moonteam import files
+from moonteam.errors import InputError
 from training.config import Config
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from rich.console import Console
 
 
 class Metrics:
-    """Appends one JSON object a chunk to `metrics.jsonl`."""
+    """Appends one JSON object a chunk to `metrics.jsonl`, and its numbers to TensorBoard's events.
 
-    def __init__(self, path: Path, resumed_updates: int):
-        """Keeps the lines of an earlier stretch up to `resumed_updates`, drops later ones."""
-        self.path = path
+    `close` at the end.
+    """
+
+    def __init__(self, path: Path, resumed_updates: int, tensorboard: bool = False):
+        """Keeps the lines of an earlier stretch up to `resumed_updates`, drops later ones.
+
+        Raises InputError if TensorBoard is asked for and its writer is not installed.
+        """
+        writer = tensorboard_writer() if tensorboard else None
+        self.path, self.events = path, None
         self.rows = [row for row in read(path) if row["total_updates"] <= resumed_updates]
         files.write_text(path, "".join(files.dump_json(row) + "\n" for row in self.rows))
+        if writer:
+            done = self.rows[-1]["env_steps"] if self.rows else 0
+            # What an earlier stretch wrote from here on is hidden: it is trained anew.
+            self.events = writer(str(path.parent), purge_step=done + 1)
 
     def add(self, row: dict[str, Any]) -> None:
         """One more line, on disk at once."""
         self.rows.append(row)
         with self.path.open("a", encoding="utf-8") as out:
             out.write(files.dump_json(row) + "\n")
+        if self.events:
+            for name, value in scalars(row).items():
+                self.events.add_scalar(name, value, row["env_steps"])
+            self.events.flush()
+
+    def close(self) -> None:
+        """Nothing is added after this."""
+        if self.events:
+            self.events.close()
+
+
+def tensorboard_writer() -> Any:
+    """The class that writes TensorBoard's events. Raises InputError if it is not installed."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise InputError("--tensorboard", "needs tensorboardX, which is not installed: "
+                         "pip install 'moonteam[tensorboard]'") from None
+    return SummaryWriter
+
+
+def scalars(row: dict[str, Any], prefix: str = "") -> dict[str, float]:
+    """The numbers of a row by name; those of a held-out score as argmax/success and so on."""
+    found: dict[str, float] = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            found |= scalars(value, f"{prefix}{key}/")
+        elif isinstance(value, (int, float)):
+            found[prefix + key] = value
+    return found
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -77,34 +120,35 @@ def collapsed(rows: list[dict[str, Any]], scenarios: int) -> bool:
 
 
 class Progress:
-    """A live line on standard error when it is a terminal, else nothing."""
+    """Two live lines on standard error when it is a terminal, else nothing."""
 
-    def __init__(self, config: Config, done: int):
-        """`done`: env steps already behind us."""
-        self.bar, self.task = None, None
-        if sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    def __init__(self, config: Config, done: int, console: Console | None = None):
+        """`done`: env steps already behind us; `console`: where to show it, if not there."""
+        self.bar, self.task, self.score = None, None, ""
+        if console is None and not sys.stderr.isatty():
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-            total = sum(config.env_steps(phase) for _, phase in config.phases)
-            self.bar = Progress(TextColumn("{task.description}"), BarColumn(),
-                                TimeRemainingColumn(), TextColumn("{task.fields[line]}"),
-                                console=Console(stderr=True))
-            self.task = self.bar.add_task(config.name, total=total, completed=done,
-                                          line="compiling")
-            self.bar.start()
-        self.score = ""
+        total = sum(config.env_steps(phase) for _, phase in config.phases)
+        # The estimate must outlive a chunk, which takes minutes where the network is large.
+        self.bar = Progress(TextColumn("{task.description}"), BarColumn(bar_width=10),
+                            TimeRemainingColumn(), TextColumn("{task.fields[line]}"),
+                            console=console or Console(stderr=True), speed_estimate_period=1800)
+        self.task = self.bar.add_task(config.name, total=total, completed=done, line="compiling")
+        self.bar.start()
 
     def show(self, row: dict[str, Any]) -> None:
-        """Brings the line up to date with a metrics row."""
+        """Brings the lines up to date with a metrics row."""
+        if self.bar is None or self.task is None:
+            return
         if "argmax" in row:
             held_out = row["argmax"]
-            self.score = (f"held-out success {held_out['success']:.3f} makespan "
-                          f"{held_out['makespan']:.1f} moves {held_out['moves']:.1f}")
-        if self.bar is not None and self.task is not None:
-            line = (f"{row['phase']} {row['env_steps']:,} env steps, {row['rate']:,.0f}/s, "
-                    f"success {row['success']:.3f}  {self.score}")
-            self.bar.update(self.task, completed=row["env_steps"], line=line)
+            self.score = (f"held out {held_out['success']:.3f} success, "
+                          f"{held_out['makespan']:.1f} makespan, {held_out['moves']:.1f} moves")
+        line = f"{row['phase']}, {row['env_steps']:,} env steps, {row['rate']:,.0f}/s"
+        self.bar.update(self.task, completed=row["env_steps"],
+                        line=f"{line}\n{self.score or 'held out: no evaluation yet'}")
 
     def stop(self) -> None:
         """Leaves the terminal as it was."""

@@ -127,7 +127,8 @@ def test_killed_and_resumed_is_bit_identical(whole, tmp_path):
         time.sleep(0.01)
     child.send_signal(signal.SIGKILL)
     child.communicate()
-    assert main(words(tmp_path, "--resume", "--checkpoint-seconds", "0")) == 0
+    assert main(words(tmp_path, "--resume", "--checkpoint-seconds", "0", "--tensorboard")) == 0
+    assert list(tmp_path.glob("events.out.tfevents.*"))
     run = Run(TINY, tmp_path, resume=True)
     assert run.position.total_updates == 10
     assert same(bits(run), bits(whole))
