@@ -203,3 +203,13 @@ def test_temperature_is_part_of_the_decoding():
     assert parse("best-of-16@0.250").name == "best-of-16@0.25"
     assert parse("argmax@1.0") == parse("argmax")
     assert parse("sample@0.5") == parse("sample")
+
+
+def test_time_limits_make_rows():
+    names = [c.name for c in contenders(Options(["greedy", "lns"], time_limits=(0.1, 1.0)))]
+    assert names == ["greedy(makespan)", "lns(makespan, 0.1 s)", "lns(makespan, 1 s)"]
+    rows = contenders(Options(["lns", "cpsat"], time_limits=(0.1,)))
+    assert [c.name for c in rows] == ["lns(makespan)", "cpsat(makespan)"]
+    assert [c.planner.time_limit for c in rows] == [0.1, 0.1]
+    with pytest.raises(InputError, match=r"time-limit: 0\.0 is not allowed"):
+        contenders(Options(["lns"], time_limits=(0.0,)))

@@ -30,7 +30,7 @@ class Args:
     Examples:
       moonteam evaluate grid 3x5 --planner exact --planner greedy --limit 200
       moonteam evaluate grid set.jsonl --planner exact --objective makespan --objective moves
-      moonteam evaluate grid 3x7 --planner lns --time-limit 0.1 --out runs/lns
+      moonteam evaluate grid 8x40 --planner lns --time-limit 0.01 --time-limit 0.1 --limit 20
       moonteam evaluate grid --count 500 --targets 3 --side 8 --max-steps 48 --planner policy
       --policy small --decode argmax --decode best-of-16
     """
@@ -57,8 +57,9 @@ class Args:
     """Weight of the makespan in the objective weighted."""
     beta: float = 0.05
     """Weight of the moves in the objective weighted."""
-    time_limit: float | None = None
-    """Seconds a scenario that anytime planners may take; theirs by default."""
+    time_limit: Many[tuple[float, ...]] = ()
+    """Seconds a scenario that anytime planners (exact, lns, cpsat) may take; again for
+    more rows. Default: theirs."""
     seed: int = 0
     """Seed of the scenarios drawn, of sampling and of the bootstrap."""
     limit: int | None = None
@@ -128,7 +129,7 @@ def options_of(args: Any) -> Any:
         policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
         preferences=args.preference, decodes=args.decode or ("argmax",),
         alpha=getattr(args, "alpha", 1.0), beta=getattr(args, "beta", 0.05),
-        time_limit=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False))
+        time_limits=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False))
 
 
 def repeated(args: Any, name: str, more: dict[str, object]) -> str:

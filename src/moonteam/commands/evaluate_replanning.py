@@ -55,8 +55,9 @@ class Args:
     """Without SET: steps in which a scenario must be solved."""
     seed: int = 0
     """Seed of the scenarios drawn, of sampling and of the bootstrap."""
-    time_limit: float | None = None
-    """Seconds a plan that anytime planners may take; theirs by default."""
+    time_limit: Many[tuple[float, ...]] = ()
+    """Seconds a plan that anytime planners (exact, lns, cpsat) may take; again for
+    more rows. Default: theirs."""
     limit: int | None = None
     """Only the first so many scenarios of the set."""
     json: bool = False

@@ -95,7 +95,7 @@ def _row(name: str, policy: Path, args: Args) -> dict:
     from moonteam.evaluation.contenders import called, contenders
 
     asked = SimpleNamespace(planner=("policy",), objective=(), policy=(str(policy),),
-                            time_limit=None, seed=args.seed)
+                            time_limit=(), seed=args.seed)
     found = load_set(name, args.limit)
     label = Path(name).stem
     if len(args.policy) > 1:

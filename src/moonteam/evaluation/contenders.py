@@ -43,7 +43,8 @@ class Options:
     decodes: Sequence[str] = ("argmax",)
     alpha: float = 1.0
     beta: float = 0.05
-    time_limit: float | None = None
+    time_limits: Sequence[float] = ()
+    """Seconds a plan that anytime planners may take, one row each; empty: theirs."""
     seed: int = 0
     alone: bool = False
 
@@ -81,29 +82,36 @@ class Contender(Protocol):
         ...
 
 
-def _exact(options: Options, objective: Objective) -> WholePlanner:
-    return ExactPlanner(objective, options.alpha, options.beta, options.time_limit)
+Seconds = float | None
 
 
-def _greedy(options: Options, objective: Objective) -> WholePlanner:
+def _exact(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
+    return ExactPlanner(objective, options.alpha, options.beta, limit)
+
+
+def _greedy(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
+    del limit
     return GreedyPlanner(objective, options.alpha, options.beta)
 
 
-def _lns(options: Options, objective: Objective) -> WholePlanner:
-    return LnsPlanner(objective, options.alpha, options.beta, time_limit=options.time_limit,
+def _lns(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
+    return LnsPlanner(objective, options.alpha, options.beta, time_limit=limit,
                       seed=options.seed)
 
 
-def _cpsat(options: Options, objective: Objective) -> WholePlanner:
-    return CpSatPlanner(objective, options.alpha, options.beta, options.time_limit)
+def _cpsat(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
+    return CpSatPlanner(objective, options.alpha, options.beta, limit)
 
 
-def _exhaustive(options: Options, objective: Objective) -> WholePlanner:
+def _exhaustive(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
+    del limit
     return ExhaustivePlanner(objective, options.alpha, options.beta)
 
 
-PLANNERS: dict[str, Callable[[Options, Objective], WholePlanner]] = {
+PLANNERS: dict[str, Callable[[Options, Objective, Seconds], WholePlanner]] = {
     "exact": _exact, "greedy": _greedy, "lns": _lns, "cpsat": _cpsat, "exhaustive": _exhaustive}
+ANYTIME = ("exact", "lns", "cpsat")
+"""Those that a time limit stops with the best plan found so far."""
 LIMITS = {"exact": exact.MAX_TARGETS, "exhaustive": exhaustive.MAX_TARGETS}
 """Targets of a scenario that some planners refuse to go beyond."""
 
@@ -115,11 +123,13 @@ class Planned:
     planner: WholePlanner
     kind: str
     objective: Objective
+    limit: Seconds = None  # where there are rows with several
 
     @property
     def name(self) -> str:
-        """Such as exact(makespan)."""
-        return f"{self.kind}({self.objective})"
+        """Such as exact(makespan) or lns(makespan, 0.1 s)."""
+        seconds = "" if self.limit is None else f", {self.limit:g} s"
+        return f"{self.kind}({self.objective}{seconds})"
 
     def check(self, world: World) -> None:
         """Raises InputError, the planner's own, if a scenario has too many targets for it."""
@@ -226,6 +236,9 @@ def contenders(options: Options) -> list[Contender]:
     for objective in options.objectives:
         if objective not in OBJECTIVES:
             raise InputError("--objective", f"{objective!r} is not one of {', '.join(OBJECTIVES)}")
+    for limit in options.time_limits:
+        if not limit > 0.0:
+            raise InputError("--time-limit", f"{limit} is not allowed; above 0")
     given: list[Objective] = [OBJECTIVES[o] for o in dict.fromkeys(options.objectives)]
     objectives: list[Objective] = given or ["makespan"]
     found: list[Contender] = []
@@ -233,7 +246,10 @@ def contenders(options: Options) -> list[Contender]:
         if planner == "policy":
             found += _policies(options, given)
         elif planner in PLANNERS:
-            found += [Planned(PLANNERS[planner](options, o), planner, o) for o in objectives]
+            limits = [*dict.fromkeys(options.time_limits)] if planner in ANYTIME else []
+            found += [Planned(PLANNERS[planner](options, o, limit), planner, o,
+                              limit if len(limits) > 1 else None)
+                      for o in objectives for limit in limits or [None]]
         else:
             raise InputError("--planner", f"{planner!r} is not one of {_known()}")
     if options.policies and "policy" not in options.planners:
