@@ -27,19 +27,18 @@ PRESETS = {
     "quick": Imitation(families=PAPER, rounds=900, num_envs=256, batches=2),
     "any_team": Imitation(
         families=(
-            *(dataclasses.replace(family, shrink=2) for family in PAPER),
-            Family(2, 6, sides=(8, 32), shrink=4),
-            Family(3, 9, sides=(16, 48), shrink=2),
+            *PAPER,
+            Family(2, 6, sides=(8, 32)),
+            Family(3, 9, sides=(16, 48)),
             Family(4, 7, num_skills=3, sides=(16, 64), max_steps=256),
             Family(5, 9, num_skills=3, sides=(16, 40)),
             Family(6, 11, sides=(16, 40), exact_to=9, iterations=100),
-            Family(3, 6, grounds=1024, shrink=2),
-            Family(4, 7, num_skills=3, grounds=512, shrink=2),
-            Family(8, 16, sides=(16, 40), exact_to=8, iterations=100, shrink=2),
-            Family(5, 18, exact_to=7, iterations=100, shrink=2),
-            Family(7, 30, num_skills=3, exact_to=7, iterations=100, shrink=4),
+            Family(3, 6, grounds=1024),
+            Family(4, 7, num_skills=3, grounds=512),
+            Family(5, 18, exact_to=7, iterations=100, shrink=4),
+            Family(7, 30, num_skills=3, exact_to=7, iterations=100, shrink=8),
         ),
-        rounds=2200, batches=2),
+        rounds=1300, batches=2),
 }
 """Presets of `moonteam train` that imitate the exact planner."""
 
