@@ -249,7 +249,7 @@ class Run:
             whole = gather(self.learner._replace(key=jax.random.key_data(self.learner.key)))
             best = record.best(self.metrics.rows)
             self.last_good = checkpoints.save(self.folder, whole, about,
-                                              best and best["total_updates"])
+                                              best["total_updates"] if best else None)
         self.last_saved = time.monotonic()
 
     def finish(self) -> dict[str, Any]:
