@@ -5,7 +5,6 @@ Legend: T steps, E environments, N agents.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -134,20 +133,21 @@ def update(networks: Networks, task: Task, hyper: Hyper,
     return learner, Report(report, value_loss, batch.steps.reward.mean(), batch.tally)
 
 
-def chunk(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
-          count: int) -> tuple[Learner, Report]:
-    """`count` updates in one call, on the devices that the learner is spread over.
-
-    The learner is donated; the report's leaves are [count].
-    """
-    with sharding.mesh_of(learner.carry.reset_before):
-        return _chunk(networks, task, hyper, learner, count)
-
-
-@partial(jax.jit, static_argnames=("networks", "task", "hyper", "count"), donate_argnames="learner")
-def _chunk(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
-           count: int) -> tuple[Learner, Report]:
+def several(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
+            count: int) -> tuple[Learner, Report]:
+    """`count` updates, to be jitted; the report's leaves are [count]."""
     def body(learner: Learner, _: None) -> tuple[Learner, Report]:
         return update(networks, task, hyper, learner)
 
     return jax.lax.scan(body, learner, length=count)
+
+
+_several = jax.jit(several, static_argnames=("networks", "task", "hyper", "count"),
+                   donate_argnames="learner")
+
+
+def chunk(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
+          count: int) -> tuple[Learner, Report]:
+    """`several` in one call, on the devices that the learner is spread over; donates it."""
+    with sharding.mesh_of(learner.carry.reset_before):
+        return _several(networks, task, hyper, learner, count)
