@@ -140,11 +140,11 @@ def test_ended_episodes_of_a_jaxmarl_env_begin_anew(task):
 def test_a_shared_value_is_that_of_the_critic_on_observations_in_order():
     own = Networks(Recurrent(5, 4), Recurrent(1, 4), (1.0, 0.5), 3)
     shared = Networks(own.actor, own.critic, own.scale, 3, shared_value=True)
-    params, obs = own.init(jax.random.key(0)).critic, jax.random.normal(jax.random.key(1),
-                                                                        (5, 2, 3, 2))
+    params = jax.jit(own.init)(jax.random.key(0)).critic
+    obs = jax.random.normal(jax.random.key(1), (5, 2, 3, 2))
     reset = jnp.zeros((5, 2), bool).at[3].set(True)
-    _, each = own.values(params, own.empty(2).critic, obs, reset)
-    memory, once = shared.values(params, shared.empty(2).critic, obs, reset)
+    _, each = jax.jit(own.values)(params, own.empty(2).critic, obs, reset)
+    memory, once = jax.jit(shared.values)(params, shared.empty(2).critic, obs, reset)
     assert memory.shape == (2, 1, 4)
     np.testing.assert_allclose(once, jnp.broadcast_to(each[..., :1], once.shape), rtol=1e-5)
 
