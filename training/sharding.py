@@ -78,10 +78,10 @@ def everywhere(mesh: Mesh, tree: Any) -> Any:
 def mesh_of(array: jax.Array) -> Iterator[None]:
     """The devices that `array` is spread over, known to `along` and `whole` inside."""
     found = array.sharding
-    if not isinstance(found, NamedSharding):
-        yield
-        return
-    with jax.set_mesh(found.mesh):
+    if isinstance(found, NamedSharding) and isinstance(found.mesh, Mesh):
+        with jax.set_mesh(found.mesh):
+            yield
+    else:
         yield
 
 
