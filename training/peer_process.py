@@ -125,6 +125,8 @@ def theirs(load: Load) -> Built:
 
     enable_cache()
     module, notes = _loaded(load.checkout)
+    found = _commit(load.checkout)
+    notes.append(f"commit {found or 'unknown'}")
     key = jax.random.PRNGKey(0)
     try:
         # What it logs is sent to the host after every update; here nobody looks at it.
@@ -138,7 +140,7 @@ def theirs(load: Load) -> Built:
     bench.seconds(lambda: begin(key))
     row = {"device": loop.describe_device(), "compile_s": compile_s, "compiled_bytes": bytes_,
            "begin_s": min(bench.seconds(lambda: begin(key)) for _ in range(3)),
-           "notes": notes, "commit": _commit(load.checkout), **_counts(learned, load)}
+           "notes": notes, "commit": found, **_counts(learned, load)}
     return lambda: program(key), row
 
 
