@@ -76,7 +76,9 @@ class Rules:
     fall_tilt: float = float(np.radians(60.0))
     fall_s: float = 2.0
     stuck_progress: float = 0.25  # of a leg; a time-out with less counts towards stuck
-    stuck_after: int = 2  # such time-outs in a row
+    # Such time-outs in a row. Two are not enough: legs that hook on a rock in one direction have
+    # come free at the third try, for by then the ground has been closed or they stand otherwise.
+    stuck_after: int = 3
     crowd_cells: float = 1.2  # a robot that near, not the ground, is why another was late
 
     @property
@@ -259,7 +261,7 @@ class Execution:
                     and self.frame.inside(xy, np.array(leg.goal_cell)))
 
     def _note_stall(self, robot: int, leg: Leg) -> None:
-        """A time-out: with too little progress, twice in a row, the robot counts as stuck."""
+        """A time-out: with too little progress, `stuck_after` in a row, the robot is stuck."""
         length = float(np.hypot(*(leg.waypoint - leg.start_xy)))
         left = float(np.hypot(*(leg.waypoint - self._xy[robot])))
         stalled = length - left < self.rules.stuck_progress * length

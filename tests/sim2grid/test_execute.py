@@ -58,15 +58,16 @@ def test_time_out_with_progress_is_replanned_from_the_true_cell(mission, execute
     assert done.record.replans == [(1, "timeout")]
 
 
-def test_stuck_after_two_time_outs_without_progress(mission, execute, script):
-    spec = mission(["a wheeled A 0 0", "b legged A 3 3"], ["A OR 3 0"])
-    steps = ["right stay", "up stay", *["stay down"] * 3]
+def test_stuck_after_three_time_outs_without_progress(mission, execute, script):
+    spec = mission(["a wheeled A 1 0", "b legged A 3 3"], ["A OR 3 0"])
+    steps = ["right stay", "up stay", "left stay", *["stay down"] * 3]
     done = execute(spec, script(*steps), faults={(0, 0.0): "still"})
     assert [(x.robot, x.cause) for x in done.record.losses] == [(0, "stuck")]
     assert done.record.success
     assert done.record.solves[0].robots == (1,)
     assert (1, "timeout") in done.record.replans
-    assert (2, "robot_lost") in done.record.replans
+    assert (2, "timeout") in done.record.replans
+    assert (3, "robot_lost") in done.record.replans
 
 
 @pytest.mark.parametrize(("fault", "cause"), [
