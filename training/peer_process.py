@@ -59,7 +59,8 @@ def serve(pipe: Any, build: Callable[[Load], Built], load: Load) -> None:
     """Answers begin, run and end until the other end of the pipe is closed."""
     from training.bench import peak_bytes, seconds
 
-    os.dup2(2, 1)  # standard output is the document's; jaxmarl prints when it is imported
+    with open(os.devnull, "wb") as nowhere:  # jaxmarl prints when it is imported
+        os.dup2(nowhere.fileno(), 1)
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # two share an accelerator
     sys.path.insert(0, str(load.checkout))  # the env of the same checkout
     run: Callable[[], Any] | None = None

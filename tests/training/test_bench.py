@@ -1,4 +1,5 @@
 import json
+from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
@@ -149,8 +150,8 @@ def test_a_shared_value_is_that_of_the_critic_on_observations_in_order():
     np.testing.assert_allclose(once, jnp.broadcast_to(each[..., :1], once.shape), rtol=1e-5)
 
 
+@pytest.mark.skipif(find_spec("jaxmarl") is None, reason="importing it here would end capsys")
 def test_both_sides_in_turns(checkout, tmp_path, capsys):
-    pytest.importorskip("jaxmarl")
     words = ["bench", "train", "--jaxmarl", str(checkout), "--num-envs", "4", "--updates", "1",
              "--repeats", "2", "--json", "--out", str(tmp_path / "out")]
     assert main(words) == 0
