@@ -57,11 +57,11 @@ class Sweep:
 
 
 SWEEPS: dict[Quantity, Sweep] = {
-    "slope": Sweep("added slope, degrees", 0.0, (0.0, 4.0, 8.0, 12.0)),
-    "boulders": Sweep("boulders, times the preset's", 1.0, (0.0, 1.0, 4.0, 8.0)),
-    "friction": Sweep("friction", 0.75, (0.3, 0.5, 0.75, 1.0)),
-    "noise": Sweep("position error, m", 0.0, (0.0, 0.1, 0.2, 0.4)),
-    "delay": Sweep("delay of commands, s", 0.0, (0.0, 0.2, 0.4, 1.0)),
+    "slope": Sweep("added slope, degrees", 0.0, (0.0, 5.0, 10.0, 15.0)),
+    "boulders": Sweep("boulders, times the preset's", 1.0, (0.0, 1.0, 8.0, 32.0)),
+    "friction": Sweep("friction", 0.75, (0.15, 0.3, 0.5, 0.75, 1.0)),
+    "noise": Sweep("position error, m", 0.0, (0.0, 0.1, 0.2, 0.4, 0.8)),
+    "delay": Sweep("delay of commands, s", 0.0, (0.0, 0.2, 0.5, 1.0, 2.0)),
 }
 
 
