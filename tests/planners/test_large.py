@@ -62,8 +62,8 @@ def test_an_iteration_budget_makes_it_repeatable():
 
 def test_no_iterations_are_the_greedy_plan():
     snapshot = Snapshot.start(grid.generate(1, num_agents=5, num_targets=20))
-    plans = [LnsPlanner("moves", iterations=0).plan(snapshot), GreedyPlanner("moves").plan(snapshot)]
-    np.testing.assert_array_equal(plans[0].actions, plans[1].actions)
+    none, greedy = LnsPlanner("moves", iterations=0), GreedyPlanner("moves")
+    np.testing.assert_array_equal(none.plan(snapshot).actions, greedy.plan(snapshot).actions)
 
 
 def test_a_time_limit_stops_it():
