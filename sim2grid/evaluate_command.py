@@ -75,6 +75,8 @@ class Args:
     """Chance for each mission that one robot is silent for 5 to 14 decisions."""
     new_targets: int = 0
     """New targets that appear in mid-mission, each at a random decision."""
+    impassable: int = 0
+    """Cells on the way of a robot on the ground that turn out closed to its kind."""
     seed: int = 0
     """Seed of the missions, their events and the planners."""
     backend: tuple[Literal["native", "mjx"], ...] = ("native",)
@@ -136,15 +138,15 @@ def _check(args: Args) -> None:
     journal.check(args, (
         ("count", 1, 100_000), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
         ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096), ("threads", 0, 1024),
-        ("new_targets", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1), ("slow", 0, 1),
-        ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
+        ("new_targets", 0, 64), ("impassable", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1),
+        ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
 
 
 def _evaluation(args: Args) -> Evaluation:
     from sim2grid.evaluate import Contender, Evaluation, contenders
     from sim2grid.fleet import Rates, Recipe
 
-    rates = Rates(args.lose, args.slow, args.silent, args.new_targets)
+    rates = Rates(args.lose, args.slow, args.silent, args.new_targets, args.impassable)
     recipes = [Recipe(site, args.site_seed, args.seed, args.targets, args.side, args.cell,
                       args.max_steps, rates) for site in args.site]
     who = [Contender("closed", "barrier", name, args.policy if name == "policy" else None,
@@ -156,10 +158,10 @@ def _evaluation(args: Args) -> Evaluation:
 
 def _options(args: Args) -> dict[str, Any]:
     """What the rows depend on; the same in a run and in what resumes it."""
-    left_out = (*_NOT_REPEATED, "lose", "slow", "silent", "new_targets")
+    left_out = (*_NOT_REPEATED, "lose", "slow", "silent", "new_targets", "impassable")
     options = {key: value for key, value in asdict(args).items() if key not in left_out}
     rates = {"lose": args.lose, "slow": args.slow, "silent": args.silent,
-             "new_targets": args.new_targets}
+             "new_targets": args.new_targets, "impassable": args.impassable}
     return options | {"rates": rates}
 
 

@@ -20,8 +20,20 @@ import numpy.typing as npt
 from moonteam import mission as missions
 from moonteam.errors import InputError
 from moonteam.grid import scenarios
-from moonteam.mission import Event, Kind, Map, Mission, Robot, Silent, Site, Slow, Target
+from moonteam.mission import (
+    Event,
+    Impassable,
+    Kind,
+    Map,
+    Mission,
+    Robot,
+    Silent,
+    Site,
+    Slow,
+    Target,
+)
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
+from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
 from moonteam.robots import KINDS
@@ -47,12 +59,13 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Rates:
-    """What happens to random missions: chances for each mission, and a number of targets."""
+    """What happens to random missions: chances for each mission, and numbers of things."""
 
     lose: float = 0.0  # that one robot is lost
     slow: float = 0.0  # that one robot is slowed
     silent: float = 0.0  # that one robot is silent for some decisions
     new_targets: int = 0
+    impassable: int = 0  # cells on the exact plan's way that turn out closed to a kind
 
 
 @dataclass(frozen=True)
@@ -176,7 +189,8 @@ def _draw_events(rates: Rates, mission: Mission, scenario: Scenario,
                  rng: np.random.Generator) -> tuple[Event, ...]:
     """Events in the middle half of the exact plan, in the order of their decisions."""
     snapshot = Snapshot.start(scenario)
-    length = ExactPlanner().plan(snapshot).makespan or 1
+    plan = ExactPlanner().plan(snapshot)
+    length = plan.makespan or 1
     names = [robot.name for robot in mission.robots]
 
     def when() -> int:
@@ -194,7 +208,24 @@ def _draw_events(rates: Rates, mission: Mission, scenario: Scenario,
         if chance < rate]
     events += [Event(when(), target=target)
                for target in _new_targets(rates.new_targets, snapshot, mission, rng)]
+    events += _closed_ways(rates.impassable, simulate.replay(snapshot, plan.actions).cells,
+                           mission, when, rng)
     return tuple(sorted(events, key=lambda event: event.at_decision))
+
+
+def _closed_ways(count: int, cells: npt.NDArray[np.int_], mission: Mission,
+                 when: Callable[[], int], rng: np.random.Generator) -> list[Event]:
+    """News that a cell which the exact plan, at `cells` [T + 1, R, 2], has yet to cross with a
+    robot on the ground is closed to its kind.
+    """
+    on_ground = [i for i, robot in enumerate(mission.robots) if robot.kind not in FLYERS]
+    found = []
+    for _ in range(count):
+        at, robot = when(), int(rng.choice(on_ground))
+        step = int(rng.integers(min(at + 1, len(cells) - 1), len(cells)))
+        x, y = cells[step, robot].tolist()
+        found.append(Event(at, impassable=Impassable(mission.robots[robot].kind, (x, y))))
+    return found
 
 
 def _new_targets(count: int, snapshot: Snapshot, mission: Mission,

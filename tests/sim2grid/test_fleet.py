@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
 from sim2grid.fleet import Rates, Recipe, make_fleet
@@ -67,6 +68,21 @@ def test_events_come_by_their_rates_in_the_middle_half_and_change_nothing_else(f
         assert sum(event.silent is not None for event in mission.events) == 0
         new = [event.target.at for event in mission.events if event.target]
         assert len({*new, *(target.at for target in mission.targets)}) == 5
+
+
+def test_ground_turns_out_closed_where_the_plan_leads():
+    flat = Recipe("flat", 0, 1, num_targets=2, side=6)
+    calm = make_fleet(flat, 3)
+    fleet = make_fleet(msgspec_replace(flat, rates=Rates(impassable=2)), 3)
+    for mission, problem in zip(fleet.missions, calm.scenarios, strict=True):
+        start = Snapshot.start(problem)
+        cells = simulate.replay(start, ExactPlanner().plan(start).actions).cells
+        kinds = [robot.kind for robot in mission.robots]
+        assert len(mission.events) == 2
+        for event in mission.events:
+            assert event.impassable.kind in ("legged", "wheeled")
+            ahead = cells[event.at_decision:, kinds.index(event.impassable.kind)]
+            assert list(event.impassable.at) in ahead.tolist()
 
 
 def test_a_rate_of_one_event_does_not_move_another():
