@@ -79,7 +79,7 @@ def _entity(spec: EntitySpec, params: Any, pool: Pool, preference: Array) -> tup
         return entity.look(state, horizon, wish, fields)
 
     view = jax.vmap(look)(pool.walk.state, pool.given.horizon, preference, pool.given.fields)
-    return view, entity.decide(params, spec, view, together=False).log_probs
+    return view, entity.decide(params, spec, view).log_probs
 
 
 def _answers(policy: Policy, session: Any, pool: Pool,

@@ -49,11 +49,13 @@ ENTITY_INPUTS: dict[str, tuple[int, tuple[str | int, ...], str]] = {
 class _Graph:
     """Nodes in the making; every method returns the name of its result."""
 
-    def __init__(self, params: Any):
-        self.params, self.nodes, self.constants = params, [], {}
+    def __init__(self, params: Any, outer: _Graph | None = None):
+        """`outer`: of the body of a loop, the graph around it, which keeps the constants."""
+        self.params, self.nodes, self.letter = params, [], "b" if outer else "v"
+        self.constants: dict[str, TensorProto] = outer.constants if outer else {}
 
     def __call__(self, kind: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
-        names = [f"v{len(self.nodes)}_{i}" for i in range(outputs)]
+        names = [f"{self.letter}{len(self.nodes)}_{i}" for i in range(outputs)]
         self.nodes.append(helper.make_node(kind, inputs, names, **attributes))
         return names if outputs > 1 else names[0]
 
@@ -201,6 +203,48 @@ def _block(g: _Graph, spec: EntitySpec, params: Any, x: str, bias: str, mask: st
     return g.add(x, g.dense(params["down"], y))
 
 
+def _agree(g: _Graph, pointer: str, agent: str, need: str, agents: str) -> str:
+    """Pointer logits [B, N, M + 1] after all claims, see `entity.agree`; skills are bits.
+
+    agent [B, N, S], need [B, M, S], agents [1]: N. One turn of the loop is one agent's claim.
+    """
+    b = _Graph(g.params, g)
+    none, yes = b.constant(-FAR), b.number("claim_waiting")
+    sure = b("ReduceMax", b("LogSoftmax", "claim_logits", axis=-1), axes=[2], keepdims=0)
+    turn = b("ArgMax", b("Where", "claim_waiting", sure, b.constant(-2.0 * FAR)), axis=1)
+    everyone = b("Range", b.constant(0, np.int64), b("Squeeze", agents), b.constant(1, np.int64))
+    mine = b.number(b("Equal", everyone, turn))  # [B, N]
+    weight = b.wide(mine, 2)
+    row = b.total(b("Mul", weight, "claim_logits"), 1)  # [B, M + 1]
+    slots = b("Squeeze", b("Gather", b("Shape", row), b.ints(1)))
+    numbers = b("Range", b.constant(0, np.int64), slots, b.constant(1, np.int64))
+    picked = b("Equal", numbers, b("ArgMax", row, axis=1))
+    picked = b.wide(b.part(picked, 1, b.ints(0), b.ints(-1)), 2)  # [B, M, 1]
+    skills = b.wide(b.total(b("Mul", weight, agent), 1), 1)  # [B, 1, S]
+    others = b("Mul", b("Sub", b.constant(1.0), skills), b.wide(b.number("target_and"), 2))
+    missing = b("Where", picked, b("Mul", "claim_missing", others), "claim_missing")
+    waiting = b("Greater", b("Sub", yes, mine), b.constant(0.5))
+    useless = b("Less", b("MatMul", agent, b.flipped(missing)), b.constant(0.5))
+    shut = b.both(useless, b.wide(waiting, 2))
+    logits = b("Where", shut, none, b.part("claim_logits", 2, b.ints(0), b.ints(-1)))
+    logits = b.join(logits, b.part("claim_logits", 2, b.ints(-1), b.ints(_LAST)))
+    going = b("Identity", "claim_going")
+
+    def info(name: str, kind: int, *dims: str | int) -> Any:
+        return helper.make_tensor_value_info(name, kind, dims)
+
+    carried = (("logits", logits, FLOAT, ("batch", "agents", "choices")),
+               ("missing", missing, FLOAT, ("batch", "targets", MAX_SKILLS)),
+               ("waiting", waiting, BOOL, ("batch", "agents")))
+    body = helper.make_graph(
+        b.nodes, "claim",
+        [info("claim_number", TensorProto.INT64), info("claim_going", BOOL),
+         *(info(f"claim_{name}", kind, *dims) for name, _, kind, dims in carried)],
+        [info(going, BOOL), *(info(made, kind, *dims) for _, made, kind, dims in carried)])
+    return g("Loop", g("Squeeze", agents), "", pointer, need, "agent_mask", outputs=3,
+             body=body)[0]
+
+
 def _mix(g: _Graph, pointer: str, free: str, share: float) -> None:
     """Action log-probabilities from pointer and free logits, as the output `log_probs`."""
     weight = g("Softmax", pointer, axis=-1)
@@ -220,7 +264,9 @@ def _mix(g: _Graph, pointer: str, free: str, share: float) -> None:
 
 
 def entity_graph(policy: PolicyFile, spec: EntitySpec) -> ModelProto:
-    """The entity network; outputs `log_probs` [B, N, 5] and `pointer` [B, N, M + 1]."""
+    """The entity network; outputs `log_probs` [B, N, 5], claims settled, and `pointer`
+    [B, N, M + 1] as it was before that.
+    """
     g = _Graph(policy.params)
     agent, need = _bits(g, "agent_skills"), _bits(g, "target_skills")
     can = _usable(g, agent, need)
@@ -243,7 +289,8 @@ def entity_graph(policy: PolicyFile, spec: EntitySpec) -> ModelProto:
     logits = g("Where", can, g.add(match, bias), g.constant(-FAR))
     pointer = g.join(logits, g.dense(g.params["stay"], robots))
     g.nodes.append(helper.make_node("Identity", [pointer], ["pointer"]))
-    _mix(g, pointer, g.dense(g.params["free"], robots), spec.free)
+    acting = _agree(g, pointer, agent, need, count)
+    _mix(g, acting, g.dense(g.params["free"], robots), spec.free)
     given = [helper.make_tensor_value_info(name, kind, ["batch", *dims], words)
              for name, (kind, dims, words) in ENTITY_INPUTS.items()]
     made = [helper.make_tensor_value_info("log_probs", FLOAT, ["batch", "agents", 5],
