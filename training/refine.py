@@ -46,8 +46,8 @@ class Args:
     """Run folder; runs/refine-SEED if not given."""
     resume: bool = False
     """Go on with the run in the folder."""
-    beside: tuple[Path, ...] = ()
-    """Folders of other refinements to draw beside this one in beside.png."""
+    beside: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Folder of another refinement to draw beside this one in beside.png; again for more."""
     json: bool = False
     """Print the report as one JSON document and nothing else."""
 
