@@ -183,8 +183,8 @@ PRESETS = {
     "pi_7t": _paper("pi_7t", (1668, 16384, 16), (3814, 24576, 32), (2, 2)),
     "pi_5t5r": _paper("pi_5t5r", (572, 16384, 16), (1271, 30720, 32), (2, 4)),
     "small": Config(
-        "small", Phase(700, 512, 8, BOOTSTRAP, lr=2.5e-3),
-        Phase(500, 512, 8, REFINEMENT, lr=2e-3, ent_coef=0.003),
+        "small", Phase(1000, 512, 8, BOOTSTRAP, lr=2.5e-3),
+        Phase(1000, 512, 8, REFINEMENT, lr=2e-3, ent_coef=0.003),
         num_targets=3, size=(8, 8), max_steps=48, num_steps=24, width=64, approach_decay=0.3,
         update_epochs=2, gamma=0.95, chunk_updates=10, eval_every=5),
 }
