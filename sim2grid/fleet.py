@@ -34,7 +34,7 @@ from moonteam.mission import (
 )
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.planners import simulate
-from moonteam.planners.base import Snapshot
+from moonteam.planners.base import IntArray, Snapshot
 from moonteam.planners.exact import ExactPlanner
 from moonteam.robots import KINDS
 from moonteam.scenario import Scenario
@@ -213,7 +213,7 @@ def _draw_events(rates: Rates, mission: Mission, scenario: Scenario,
     return tuple(sorted(events, key=lambda event: event.at_decision))
 
 
-def _closed_ways(count: int, cells: npt.NDArray[np.int_], mission: Mission,
+def _closed_ways(count: int, cells: IntArray, mission: Mission,
                  when: Callable[[], int], rng: np.random.Generator) -> list[Event]:
     """News that a cell which the exact plan, at `cells` [T + 1, R, 2], has yet to cross with a
     robot on the ground is closed to its kind.
