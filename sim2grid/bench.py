@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
@@ -28,7 +27,7 @@ class DeciderPlanner:
 
     def __init__(self, decider: Decider, params: Any = None):
         self._decider, self._params = decider, params
-        self._decide = jax.jit(decider.decide)
+        self._decide, self._search = jax.jit(decider.decide), jax.jit(problem_fields)
 
     def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
         """Nothing is remembered."""
@@ -36,7 +35,7 @@ class DeciderPlanner:
     def act(self, snapshot: Snapshot) -> npt.NDArray[np.int32]:
         """Joint action [R]."""
         state = state_of(snapshot)
-        fields = problem_fields(jax.tree.map(jnp.asarray, state.problem))
+        fields = self._search(state.problem)
         states = jax.tree.map(lambda a: np.asarray(a)[None], state)
         memory = self._decider.begin(1, len(snapshot.cells))
         _, actions = self._decide(
