@@ -212,7 +212,6 @@ def test_a_broken_line_is_named(capsys, tmp_path):
     (["--planner", "policy", "--policy", "POLICY", "--decode", "beam"], "'beam' is not one of"),
     (["--planner", "policy", "--policy", "POLICY", "--preference", "2"], "0 (time) to 1"),
     (["--planner", "policy", "--policy", "POLICY", "--decode", "sample@0"], "above 0"),
-    (["--planner", "policy", "--policy", "POLICY", "--decode", "argmax-sym"], "not of kind entity"),
     (["--planner", "policy", "--policy", "nowhere"], "no such file"),
     (["--planner", "exact", "--policy", "POLICY"], "no effect"),
     (["--limit", "0"], "at least 1"),
