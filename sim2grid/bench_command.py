@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import compilation, files
 from moonteam.errors import InputError
-from sim2grid import journal
 
 if TYPE_CHECKING:
     from sim2grid.fused import Decider
@@ -113,7 +112,7 @@ def _document(args: Args, rows: list[dict[str, Any]]) -> dict[str, Any]:
     from moonteam.evaluation import provenance
     from moonteam.physics.bench import device_name
 
-    command = journal.command("bench execution", args, ("json", "markdown", "out"))
+    command = provenance.command("bench execution", args, ("json", "markdown", "out"))
     notes = [
         f"Drone, legged and wheeled robot, {args.targets} targets, {args.side} x {args.side} cells "
         f"of {args.cell:g} m on {args.site}; decisions by {args.planner}"

@@ -206,13 +206,9 @@ def _from_report(args: Args) -> Run:
 
 def _command(args: Args) -> str:
     """The command line of these options, but where it writes to."""
-    words = ["moonteam", "rollout", args.mission]
-    for field in fields(args):
-        value = getattr(args, field.name)
-        if field.name in ("mission", "out", "json", "viewer", "video") or value == field.default:
-            continue
-        words += ["--" + field.name.replace("_", "-"), str(value)]
-    return shlex.join(words)
+    from moonteam.evaluation.provenance import command
+
+    return command("rollout", args, ("out", "json", "viewer", "video"), ("mission",))
 
 
 def _load(name: str) -> Mission:

@@ -117,7 +117,7 @@ def run(args: Args) -> int:
     except KeyboardInterrupt:
         interrupted = True
     rows = evaluation.sorted_rows()
-    command = journal.command("evaluate execution", args, _NOT_REPEATED)
+    command = provenance.command("evaluate execution", args, _NOT_REPEATED)
     report = document(rows, evaluation.entries, evaluation.contenders, _options(args),
                       provenance.meta(command, args.seed), args.seed)
     if interrupted:

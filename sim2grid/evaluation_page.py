@@ -12,7 +12,7 @@ from typing import Any
 
 from sim2grid import plots
 from sim2grid.page import Raw, cell, folded, mean_interval, page, plot, table, tiles
-from sim2grid.summary import COMPARED, DIFFERENT
+from sim2grid.summary import COMPARED, DIFFERENT, compared_rows, different_rows
 
 MOST_FAILURES = 200
 """Failed missions that the page lists one by one; report.json has all."""
@@ -86,17 +86,12 @@ def intervals_plot(document: dict[str, Any]) -> str:
 def comparisons_table(document: dict[str, Any]) -> str:
     """Async against barrier, engine against engine, on the missions that both solved."""
     return "" if not document.get("comparisons") else table(
-        COMPARED,
-        [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
-          f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
-          _spread(c, "seconds", 3), _spread(c, "moves", 3)] for c in document["comparisons"]])
+        COMPARED, compared_rows(document, _spread))
 
 
 def differences_table(document: dict[str, Any]) -> str:
     """Missions in which another engine led to another outcome or number of decisions."""
-    return "" if not document.get("differences") else table(DIFFERENT, [
-        [f"{d['site']} {d['site_seed']}", d["number"], d["contender"], d["this"], d["over"],
-         d["other"], d["why"]] for d in document["differences"]])
+    return "" if not document.get("differences") else table(DIFFERENT, different_rows(document))
 
 
 def causes_table(document: dict[str, Any], source: str) -> str:

@@ -208,8 +208,9 @@ def _draw_events(rates: Rates, mission: Mission, scenario: Scenario,
         if chance < rate]
     events += [Event(when(), target=target)
                for target in _new_targets(rates.new_targets, snapshot, mission, rng)]
-    events += _closed_ways(rates.impassable, simulate.replay(snapshot, plan.actions).cells,
-                           mission, when, rng)
+    if rates.impassable:
+        cells = simulate.replay(snapshot, plan.actions).cells
+        events += _closed_ways(rates.impassable, cells, mission, when, rng)
     return tuple(sorted(events, key=lambda event: event.at_decision))
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
-from collections.abc import Collection, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -13,6 +11,7 @@ import msgspec
 
 from moonteam import __version__, files
 from moonteam.errors import InputError
+from moonteam.evaluation.provenance import flag
 
 Entry = TypeVar("Entry")
 
@@ -83,26 +82,13 @@ def check(args: Any, ranges: Sequence[tuple[str, float, float]],
     for name, low, high in ranges:
         value = getattr(args, name)
         if not low <= value <= high:
-            raise InputError(_flag(name), f"{value} is not allowed; {low} to {high}")
+            raise InputError(flag(name), f"{value} is not allowed; {low} to {high}")
     for name in choices:
         chosen = getattr(args, name)
         if len(set(chosen)) < len(chosen) or not chosen:
-            raise InputError(_flag(name), "give each once, and at least one")
+            raise InputError(flag(name), "give each once, and at least one")
     if args.resume and args.out is None:
         raise InputError("--resume", "needs the folder of the run to go on with: --out DIR")
-
-
-def command(name: str, args: Any, left_out: Collection[str]) -> str:
-    """The command that makes this report again; options at their default are left out."""
-    words = ["moonteam", *name.split()]
-    for key, value in asdict(args).items():
-        if key not in left_out and value != getattr(type(args), key):
-            words += [_flag(key), *map(str, value if isinstance(value, tuple) else (value,))]
-    return shlex.join(words)
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def progress(title: str, done: int, total: int) -> None:

@@ -45,10 +45,7 @@ class Staged:
 
 def load_report(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The document of `evaluate execution`. Raises InputError."""
-    try:
-        report = msgspec.json.decode(files.read_text(path))
-    except msgspec.DecodeError as error:
-        raise InputError(path, f"not JSON: {error}") from None
+    report = files.read_json(path)
     if not isinstance(report, dict) or report.get("kind") != "execution":
         raise InputError(path, "is no report.json of `moonteam evaluate execution`")
     return report

@@ -172,7 +172,7 @@ def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: li
     from moonteam.evaluation import provenance
     from sim2grid.sensitivity import SWEEPS, point, settings
 
-    command = journal.command("evaluate sensitivity", args, _NOT_REPEATED)
+    command = provenance.command("evaluate sensitivity", args, _NOT_REPEATED)
     curves = [
         {"quantity": quantity, "label": SWEEPS[quantity].label, "contender": name,
          "points": [{"value": s.value, "impossible": impossible.get(s.key)} | point(
@@ -204,19 +204,13 @@ NOTES = ["In brackets: 95 % intervals, of success by Wilson, of seconds by boots
 
 def _table(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """A row for each value and contender."""
+    from sim2grid.summary import spread
+
     rows = []
     for curve in report["curves"]:
         for at in curve["points"]:
             causes = "; ".join(f"{cause}: {len(found)}" for cause, found in at["failures"].items())
             rows.append([curve["label"], f"{at['value']:g}", curve["contender"],
                          at["impossible"] or f"{at['solved']} of {at['missions']}",
-                         _spread(at, "success", 2), _spread(at, "seconds", 1), causes or "-"])
+                         spread(at, "success", 2), spread(at, "seconds", 1), causes or "-"])
     return ["quantity", "value", "contender", "solved", "success", "seconds", "failed"], rows
-
-
-def _spread(at: dict[str, Any], key: str, digits: int) -> str:
-    """A figure with its interval in brackets."""
-    if at[key] is None:
-        return "-"
-    low, high = at["intervals"][key]
-    return f"{at[key]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

@@ -235,33 +235,42 @@ def tables(report: dict[str, Any]) -> list[Table]:
         physical = line["loop"] != "grid"
         cells = [f"{line['site']} {line['site_seed']}", line["loop"], line["planner"],
                  _mode(line),
-                 f"{line['solved']} of {line['missions']}, {_spread(line, 'success', 3)}"]
+                 f"{line['solved']} of {line['missions']}, {spread(line, 'success', 3)}"]
         if events:
             cells.append(f"{line['solved']} of {line['solvable']}, "
-                         + _spread(line, "success_solvable", 3))
-        cells += [_spread(line, "seconds", 1), _spread(line, "decisions", 1)]
-        cells += [_spread(line, "inflation", 3), _spread(line, "slowdown", 2),
-                  _spread(line, "wrong_cell_rate", 4), _spread(line, "timeout_rate", 4),
+                         + spread(line, "success_solvable", 3))
+        cells += [spread(line, "seconds", 1), spread(line, "decisions", 1)]
+        cells += [spread(line, "inflation", 3), spread(line, "slowdown", 2),
+                  spread(line, "wrong_cell_rate", 4), spread(line, "timeout_rate", 4),
                   _value(line["replans"], 2), str(line["falls"]), str(line["stuck"])
                   ] if physical else ["-"] * 7
         rows.append(cells)
     found: list[Table] = [(titles, rows)]
     if report["comparisons"]:
         found.append((COMPARED,
-                      [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
-                        f"{c['both_solved']} of {c['missions']}", str(c["only_this"]),
-                        str(c["only_other"]), _spread(c, "seconds", 3), _spread(c, "moves", 3)]
-                       for c in report["comparisons"]]))
+                      [[*map(str, row)] for row in compared_rows(report, spread)]))
     if report["differences"]:
-        found.append((DIFFERENT, [
-            [f"{d['site']} {d['site_seed']}", str(d["number"]), d["contender"], d["this"],
-             d["over"], d["other"], d["why"]] for d in report["differences"]]))
+        found.append((DIFFERENT, [[*map(str, row)] for row in different_rows(report)]))
     causes = [[f"{line['site']} {line['site_seed']}", line["contender"], cause, str(len(numbers)),
                _numbers(numbers)]
               for line in report["failures"] for cause, numbers in line["causes"].items()]
     if causes:
         found.append((["site", "contender", "cause of failure", "missions", "numbers"], causes))
     return found
+
+
+def compared_rows(report: dict[str, Any], write: Callable[[dict[str, Any], str, int], Any]
+                  ) -> list[list[Any]]:
+    """Cells under `COMPARED`; `write` makes one of a figure with its interval, as `spread` does."""
+    return [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
+             f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
+             write(c, "seconds", 3), write(c, "moves", 3)] for c in report["comparisons"]]
+
+
+def different_rows(report: dict[str, Any]) -> list[list[Any]]:
+    """Cells under `DIFFERENT`."""
+    return [[f"{d['site']} {d['site_seed']}", d["number"], d["contender"], d["this"],
+             d["over"], d["other"], d["why"]] for d in report["differences"]]
 
 
 def _mode(line: dict[str, Any]) -> str:
@@ -305,7 +314,7 @@ def _numbers(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:MOST_NUMBERS])) + (f" and {more} more" if more > 0 else "")
 
 
-def _spread(line: dict[str, Any], key: str, digits: int) -> str:
+def spread(line: dict[str, Any], key: str, digits: int) -> str:
     """A figure with its interval in brackets."""
     low, high = line["intervals"][key]
     if low is None or high is None:

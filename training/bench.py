@@ -83,14 +83,9 @@ def run(args: Args) -> int:
 
 def command(args: Args) -> str:
     """The words that measure this again."""
-    words, default = ["moonteam bench train"], Args()
-    for field in dataclasses.fields(args):
-        value = getattr(args, field.name)
-        if field.name in ("json", "markdown", "out") or value == getattr(default, field.name):
-            continue
-        option = "" if field.name == "preset" else f"--{field.name.replace('_', '-')} "
-        words.append(f"{option}{value}")
-    return " ".join(words)
+    from moonteam.evaluation import provenance
+
+    return provenance.command("bench train", args, ("json", "markdown", "out"), ("preset",))
 
 
 def table(document: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -125,10 +120,11 @@ def measure(args: Args) -> dict[str, Any]:
     nets = networks.for_spec(chosen.spec, chosen.precision)
     task, hyper = GridTask(chosen.env(phase)), chosen.hyper(phase)
     steps = phase.num_envs * chosen.num_steps
+    mesh = sharding.mesh_for([phase.num_envs // phase.num_minibatches])
 
     def begin() -> Learner:
-        return shared(update.begin(nets, task, hyper, phase.num_envs, jax.random.key(0)),
-                      phase.num_envs // phase.num_minibatches)
+        return update.shared(mesh, update.begin(nets, task, hyper, phase.num_envs,
+                                                jax.random.key(0)))
 
     with networks.matmul_precision(chosen.precision):
         whole = timed(lambda held: update.update(nets, task, hyper, held), begin, args.repeats)
@@ -171,15 +167,6 @@ def _notes(document: dict[str, Any]) -> list[str]:
         f"measured, {100 * document['share_of_peak']:.1f} %",
         f"memory: {document['compiled_bytes'] / 2**20:.0f} MiB compiled, peak "
         f"{document['peak_bytes'] / 2**20:.0f} MiB ({document['peak_of']})"]
-
-
-def shared(learner: Learner, rows: int) -> Learner:
-    """Spread over as many devices as divide `rows`, the environments of a minibatch."""
-    from training import sharding
-
-    mesh = sharding.mesh_for([rows])
-    whole = sharding.everywhere(mesh, learner._replace(carry=()))
-    return whole._replace(carry=sharding.spread(mesh, learner.carry))
 
 
 def compiled(work: Callable[[Any], Any], held: Any, spread: Any = None) -> tuple[Any, float, int]:

@@ -121,18 +121,13 @@ def run(args: Args) -> int:
         files.write_text(args.out / "table.md", report.markdown(document, columns()) + "\n")
         record.draw_curve(args.out / "curves.png",
                           {name: [run.rows for run in runs] for name, runs in groups.items()})
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.markdown(document, columns()))
-    else:
-        report.show(document, columns())
+    report.print_columns(args, document, columns(), columns())
     return 0
 
 
 def read(folder: Path) -> Trained:
     """A run folder. Raises InputError if it holds no MAPPO run, or one without an evaluation."""
-    config = _decode(folder / "config.json", dict[str, Any])
+    config = files.read_json(folder / "config.json", dict[str, Any])
     if not isinstance(config.get("name"), str) or not isinstance(config.get("seed"), int):
         raise InputError(folder, "is no run of the presets small or pi_*; only those are compared")
     metrics = folder / "metrics.jsonl"
@@ -140,20 +135,13 @@ def read(folder: Path) -> Trained:
     checked = files.convert(rows, list[Row], metrics)
     ended = folder / "report.json"
     if ended.exists():
-        return Trained(folder, flat(config), rows, _decode(ended, Final), True)
+        return Trained(folder, flat(config), rows, files.read_json(ended, Final), True)
     for row in reversed(checked):
         if row.argmax and row.sample:
             final = Final(row.env_steps, row.seconds, config.get("eval_scenarios", 0),
                           row.argmax, row.sample)
             return Trained(folder, flat(config), rows, final, False)
     raise InputError(metrics, "holds no evaluation on held-out scenarios yet")
-
-
-def _decode(path: Path, kind: Any) -> Any:
-    try:
-        return files.convert(msgspec.json.decode(files.read_text(path)), kind, path)
-    except msgspec.DecodeError as error:
-        raise InputError(path, f"is not JSON: {error}") from None
 
 
 def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -29,7 +29,7 @@ from training.checkpoints import About
 from training.config import Config, Phase
 from training.grid_task import GridTask
 from training.networks import Networks, Pair
-from training.sharding import anywhere, everywhere, gather, mesh_for, spread
+from training.sharding import anywhere, gather, mesh_for
 from training.update import Learner, Report
 
 FINAL_SCENARIOS = 500
@@ -138,17 +138,12 @@ class Run:
         return update.begin(self.nets, self.task(phase), self.config.hyper(phase),
                             phase.num_envs, key, params)
 
-    def _shared(self, learner: Learner) -> Learner:
-        """Environments shared out over the devices, everything else on each of them."""
-        whole = everywhere(self.mesh, learner._replace(carry=()))
-        return whole._replace(carry=spread(self.mesh, learner.carry))
-
     def _resumed(self, arrays: dict[str, np.ndarray] | None) -> Learner | None:
         if arrays is None:
             return None
         index = self.phase_names.index(self.position.phase)
         like = jax.eval_shape(lambda: self.begin(index, None))
-        return self._shared(checkpoints.unflatten(arrays, like, self.folder))
+        return update.shared(self.mesh, checkpoints.unflatten(arrays, like, self.folder))
 
     @property
     def phase_names(self) -> list[str]:
@@ -177,7 +172,7 @@ class Run:
         name, phase = self.config.phases[index]
         if self.learner is None or name != self.position.phase:
             params = gather(self.learner.params) if self.learner is not None else None
-            self.learner = self._shared(self.begin(index, params))
+            self.learner = update.shared(self.mesh, self.begin(index, params))
             self.position.phase, self.position.update = name, 0
         while self.position.update < phase.updates:
             enough = stop_after is not None and self.position.total_updates >= stop_after

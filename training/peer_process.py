@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import subprocess
 import sys
 import types
 from collections.abc import Callable
@@ -102,8 +101,9 @@ def ours(load: Load) -> Built:
                   recipe.num_steps, recipe.update_epochs, recipe.gamma, recipe.gae_lambda,
                   recipe.clip_eps / (agents if recipe.scale_clip_eps else 1), recipe.vf_coef,
                   recipe.max_grad_norm, adam_eps=1e-5, timeout_is_terminal=True)
-    learner = bench.shared(update.begin(nets, task, hyper, recipe.num_envs, jax.random.key(0)),
-                           recipe.num_envs // recipe.num_minibatches)
+    mesh = sharding.mesh_for([recipe.num_envs // recipe.num_minibatches])
+    learner = update.shared(
+        mesh, update.begin(nets, task, hyper, recipe.num_envs, jax.random.key(0)))
     program, compile_s, bytes_ = bench.compiled(
         lambda held: update.several(nets, task, hyper, held, load.updates), learner,
         learner.carry.reset_before)
@@ -122,11 +122,12 @@ def theirs(load: Load) -> Built:
     import jax.experimental
 
     from moonteam.compilation import enable_cache
+    from moonteam.evaluation.provenance import git
     from training import bench, loop
 
     enable_cache()
     module, notes = _loaded(load.checkout)
-    found = _commit(load.checkout)
+    found = git(load.checkout, "rev-parse", "--short=12", "HEAD")
     notes.append(f"commit {found or 'unknown'}")
     key = jax.random.PRNGKey(0)
     try:
@@ -235,13 +236,3 @@ class Categorical:
         import jax.numpy as jnp
 
         return -(jnp.exp(self.log_probs) * self.log_probs).sum(axis=-1)
-
-
-def _commit(checkout: Path) -> str | None:
-    """The checkout's commit, if git knows it."""
-    try:
-        done = subprocess.run(["git", "-C", str(checkout), "rev-parse", "--short=12", "HEAD"],
-                              capture_output=True, text=True, timeout=20, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import Mesh
 from jax.typing import ArrayLike
 
 from training import gae, losses, rollout, sharding
@@ -60,6 +61,12 @@ def begin(networks: Networks, task: Task, hyper: Hyper, num_envs: int, key: Arra
     return Learner(params, Pair(fresh.init(params.actor), fresh.init(params.critic)),
                    rollout.begin(networks, task, env_key, num_envs), key,
                    jnp.zeros((), jnp.int32))
+
+
+def shared(mesh: Mesh, learner: Learner) -> Learner:
+    """Environments shared out over the devices, everything else on each of them."""
+    whole = sharding.everywhere(mesh, learner._replace(carry=()))
+    return whole._replace(carry=sharding.spread(mesh, learner.carry))
 
 
 def targets(batch: Rollout, hyper: Hyper) -> tuple[Array, Array]:

@@ -116,6 +116,15 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def read_json(path: str | os.PathLike[str], kind: Any = Any) -> Any:
+    """The value of a JSON file, checked against a type. Raises InputError."""
+    try:
+        value = msgspec.json.decode(read_text(path))
+    except msgspec.DecodeError as error:
+        raise InputError(path, f"is not JSON: {error}") from None
+    return convert(value, kind, path)
+
+
 def write_json(path: str | os.PathLike[str], value: Any, indent: int = 2) -> None:
     """Writes JSON (msgspec Structs, dataclasses, lists, dicts, NumPy scalars via `.item()`)."""
     write_text(path, dump_json(value, indent) + "\n")

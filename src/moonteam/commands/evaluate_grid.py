@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-from moonteam import compilation, files, paths, scenario
+from moonteam import compilation, paths, scenario
 from moonteam.errors import InputError
 from moonteam.scenario import Scenario
 
@@ -155,12 +155,7 @@ def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
     if args.out:
         report.save(args.out, document, form.PAGE)
         figures.bars(args.out / picture, document, form.PANELS)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.markdown(document, form.PAGE))
-    else:
-        report.show(document, form.COLUMNS)
+    report.print_columns(args, document, form.PAGE, form.COLUMNS)
     if "interrupted" not in document:
         return 0
     left = ", ".join(document["interrupted"])

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import msgspec
 import tyro
 
-from moonteam import compilation, files, paths
+from moonteam import compilation, paths
 
 Many = tyro.conf.UseAppendAction
 
@@ -73,12 +73,7 @@ def run(args: Args) -> int:
     columns = _columns(args.best_of)
     if args.out:
         report.save(args.out, document, columns)
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(report.markdown(document, columns))
-    else:
-        report.show(document, columns)
+    report.print_columns(args, document, columns, columns)
     return 130 if left else 0
 
 

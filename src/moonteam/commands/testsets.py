@@ -134,7 +134,7 @@ def best_known(scenario: Scenario, iterations: int, starts: int) -> Optimal | No
 
 def make(recipe: Recipe, args: Args, tick) -> list[Scenario]:
     """One set; `tick(done)` is told about progress."""
-    from moonteam.planners.batch import cores
+    from moonteam.compilation import cores
 
     wanted = args.count or recipe.count
     source, found = draws(recipe, args.seed), []

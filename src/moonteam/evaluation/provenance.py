@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import platform
+import shlex
 import subprocess
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import moonteam
 from moonteam.compilation import cores
@@ -16,22 +20,44 @@ PACKAGES = ("moonteam", "jax", "jaxlib", "numpy", "numba", "flax")
 def commit() -> str | None:
     """The checkout's commit, with -dirty if code or assets differ; None in a wheel."""
     folder = Path(moonteam.__file__).resolve().parent
-    top = _git(folder, "rev-parse", "--show-toplevel")
+    top = git(folder, "rev-parse", "--show-toplevel")
     if top is None or not folder.is_relative_to(top) or folder != Path(top) / "src" / "moonteam":
         return None  # a wheel inside some other project's checkout
-    found = _git(folder, "rev-parse", "--short=12", "HEAD")
+    found = git(folder, "rev-parse", "--short=12", "HEAD")
     parts = [str(Path(top) / name) for name in ("src", "training", "sim2grid", "assets")]
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *parts)
+    changed = git(folder, "status", "--porcelain", "--untracked-files=no", "--", *parts)
     return f"{found}-dirty" if found and changed else found
 
 
-def _git(folder: Path, *words: str) -> str | None:
+def git(folder: Path, *words: str) -> str | None:
+    """What git says in a folder; None where it knows nothing."""
     try:
         done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True,
                               timeout=20, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def command(name: str, args: Any, left_out: Collection[str],
+            positional: Collection[str] = ()) -> str:
+    """The command that makes a report again; options at their default are left out.
+
+    `args` is the dataclass of a command called `name`.
+    """
+    words = ["moonteam", *name.split()]
+    for field in dataclasses.fields(args):
+        value = getattr(args, field.name)
+        if field.name in left_out or value == field.default:
+            continue
+        words += [] if field.name in positional else [flag(field.name)]
+        words += map(str, value if isinstance(value, tuple) else (value,))
+    return shlex.join(words)
+
+
+def flag(name: str) -> str:
+    """The option of a field."""
+    return f"--{name.replace('_', '-')}"
 
 
 def processor() -> str:
@@ -50,13 +76,13 @@ def versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
-def meta(command: str, seed: int) -> dict:
+def meta(made_by: str, seed: int) -> dict:
     """Command, seed, commit, versions and machine."""
     import jax
 
     device = jax.devices()[0]
     return {
-        "command": command,
+        "command": made_by,
         "seed": seed,
         "commit": commit(),
         "versions": {"python": platform.python_version(), **versions()},

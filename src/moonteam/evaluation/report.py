@@ -187,6 +187,19 @@ def print_plain(args: Any, document: dict,
         show_plain(document, tables)
 
 
+def print_columns(args: Any, document: dict, page: Sequence[Column],
+                  columns: Sequence[Column]) -> None:
+    """The document as `--json` or `--markdown` (with the columns of the `page`) ask for it, else
+    with all its columns for a person.
+    """
+    if args.json:
+        print(files.dump_json(document))
+    elif args.markdown:
+        print(markdown(document, page))
+    else:
+        show(document, columns)
+
+
 def plain_csv(rows: Sequence[dict]) -> str:
     """Flat rows as CSV; the keys of the first are the header."""
     out = io.StringIO()
