@@ -12,6 +12,7 @@ import shutil
 import tempfile
 import warnings
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -76,8 +77,8 @@ def place_of(folder: Path, total_updates: int) -> Path:
     return folder / f"{total_updates:08d}"
 
 
-def save(folder: Path, learner: Learner, about: About, keep: int | None = None) -> Path:
-    """Writes one checkpoint; drops all but the newest few and that after `keep` updates.
+def save(folder: Path, learner: Learner, about: About, keep: Iterable[int] = ()) -> Path:
+    """Writes one checkpoint; drops all but the newest few and those after so many updates.
 
     `learner` holds host arrays, its key as raw words. Raises InputError if it cannot be written.
     """
@@ -103,10 +104,18 @@ def save(folder: Path, learner: Learner, about: About, keep: int | None = None) 
     finally:
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
-    for old in _all(folder)[:-KEEP]:
-        if keep is None or old != place_of(folder, keep):
-            shutil.rmtree(old, ignore_errors=True)
+    for old in set(_all(folder)[:-KEEP]) - {place_of(folder, updates) for updates in keep}:
+        shutil.rmtree(old, ignore_errors=True)
     return place
+
+
+def read(place: Path) -> tuple[About, dict[str, np.ndarray]]:
+    """This one checkpoint. Raises InputError if it is none, or torn."""
+    try:
+        return _read(place)
+    except (OSError, ValueError, msgspec.MsgspecError) as error:
+        raise InputError(place, f"is no whole checkpoint ({_reason(error)}); allowed is a folder "
+                         "like RUN/checkpoints/00001000") from None
 
 
 def newest(folder: Path) -> Path | None:
@@ -120,8 +129,7 @@ def load(folder: Path) -> tuple[About, dict[str, np.ndarray]] | None:
         try:
             return _read(place)
         except (OSError, ValueError, msgspec.MsgspecError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-            warnings.warn(f"{place} is torn and was passed over ({reason})", stacklevel=2)
+            warnings.warn(f"{place} is torn and was passed over ({_reason(error)})", stacklevel=2)
     return None
 
 
@@ -133,6 +141,10 @@ def _read(place: Path) -> tuple[About, dict[str, np.ndarray]]:
         raise ValueError("its checksums do not match")
     restored = ocp.PyTreeCheckpointer().restore(place.resolve() / "learner")
     return about, {str(name): np.asarray(leaf) for name, leaf in restored.items()}
+
+
+def _reason(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 def _all(folder: Path) -> list[Path]:

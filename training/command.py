@@ -40,6 +40,7 @@ class Args:
       moonteam train small
       moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50
       moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50 --resume
+      moonteam train small --begin runs/small-0/checkpoints/00001000 --refinement.lr 1e-3
       moonteam train pi_5t --dry-run
     """
 
@@ -49,6 +50,9 @@ class Args:
     """Run folder; runs/PRESET-SEED if not given."""
     resume: bool = False
     """Go on with the run in the folder."""
+    begin: Path | None = None
+    """A checkpoint of another run, RUN/checkpoints/NUMBER: a new run that goes on from there with
+    its own numbers. Network and environments must be as they were."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints; a chunk of updates is never cut."""
     tensorboard: bool = False
@@ -128,7 +132,7 @@ def _train(args: Args) -> int:
         sharding.join(args.coordinator, args.processes, args.process)
         out = out / f"process-{args.process}" if args.process else out
     run = loop.Run(config, out, args.resume, args.checkpoint_seconds, args.stop_on_collapse,
-                   args.tensorboard)
+                   args.tensorboard, args.begin)
     say = sys.stderr if args.json else sys.stdout
     try:
         with loop.stop_on_signals() as stop:

@@ -7,6 +7,7 @@ stopped and resumed, at any chunk, ends with the same bits as one that never sto
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import signal
 import threading
 import time
@@ -86,8 +87,13 @@ class Run:
     """
 
     def __init__(self, config: Config, out: Path, resume: bool, checkpoint_seconds: float = 30.0,
-                 stop_on_collapse: bool = True, tensorboard: bool = False):
-        """Raises InputError if the folder holds a run that this one may not go on with."""
+                 stop_on_collapse: bool = True, tensorboard: bool = False,
+                 begin: Path | None = None):
+        """`begin`: a checkpoint of another run, to go on from with this one's numbers.
+
+        Raises InputError if the folder holds a run that this one may not go on with, or `begin`
+        is no checkpoint that it could begin with.
+        """
         self.config, self.out, self.checkpoint_seconds = config, out, checkpoint_seconds
         self.stop_on_collapse = stop_on_collapse
         # Of the code that is loaded now, whatever is checked out later.
@@ -95,21 +101,27 @@ class Run:
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
         self.mesh = mesh_for(p.num_envs // p.num_minibatches for _, p in config.phases)
         self.folder = out / "checkpoints"
-        self.position, arrays = self._find(resume)
+        found = self._find(resume) if begin is None else self._begun(begin, resume)
+        self.position, arrays = found
         self.learner = self._resumed(arrays)
+        if begin is not None:  # what the other run recorded until then
+            record.copy(begin.parent.parent / "metrics.jsonl", out / "metrics.jsonl")
         self.metrics = record.Metrics(out / "metrics.jsonl", self.position.total_updates,
                                       tensorboard)
         self.last_saved = time.monotonic()
         self.last_good = checkpoints.newest(self.folder)
+        if begin is not None:
+            self.save()
+        files.write_json(out / "config.json", config)
 
     def _find(self, resume: bool) -> tuple[Position, dict[str, np.ndarray] | None]:
         stored = self.out / "config.json"
-        plain = msgspec.json.decode(files.dump_json(self.config))
         held = stored.exists() or checkpoints.newest(self.folder) is not None
         if held and not resume:
             raise InputError(self.out, "already holds a run; --resume goes on with it, or choose "
                              "another --out")
         if stored.exists():
+            plain = msgspec.json.decode(files.dump_json(self.config))
             before = msgspec.json.decode(stored.read_bytes())
             odd = sorted(k for k in {**plain, **before} if plain.get(k) != before.get(k))
             if odd:
@@ -118,14 +130,31 @@ class Run:
                                  odd[0])
         found = checkpoints.load(self.folder)
         if found is None:
-            files.write_json(stored, plain)
             return Position(self.config.phases[0][0]), None
         about, arrays = found
-        if about.network != dataclasses.asdict(self.config.spec) | {"size": list(self.config.size)}:
-            raise InputError(self.folder, "holds checkpoints of another network")
-        files.write_json(stored, plain)
+        return self._position(about, self.folder), arrays
+
+    def _begun(self, begin: Path, resume: bool) -> tuple[Position, dict[str, np.ndarray]]:
+        if resume:
+            raise InputError("--begin", "is for a new run; --resume alone goes on with one")
+        self._find(resume)  # refuses a folder that holds a run
+        about, arrays = checkpoints.read(begin)
+        return self._position(about, begin), arrays
+
+    def _position(self, about: About, source: Path) -> Position:
+        """Where a checkpoint stands. Raises InputError if this run never comes there."""
+        if about.network != self._network:
+            raise InputError(source, "is of another network")
+        made = {name: phase.updates for name, phase in self.config.phases}.get(about.phase, 0)
+        if about.update > made:
+            raise InputError(source, f"stands after {about.update} updates of {about.phase}; this "
+                             f"run makes {made}", f"{about.phase}.updates")
         return Position(about.phase, about.update, about.total_updates, about.env_steps,
-                        about.seconds), arrays
+                        about.seconds)
+
+    @property
+    def _network(self) -> dict[str, Any]:
+        return dataclasses.asdict(self.config.spec) | {"size": list(self.config.size)}
 
     def task(self, phase: Phase) -> GridTask:
         """The phase's grid world."""
@@ -184,7 +213,8 @@ class Run:
             if self.stop_on_collapse:
                 self._check_standing()
             due = time.monotonic() - self.last_saved > self.checkpoint_seconds
-            if anywhere(due or row is record.best(self.metrics.rows)):
+            ended = self.position.update >= phase.updates
+            if anywhere(due or ended or row is record.best(self.metrics.rows)):
                 self.save()
         return True
 
@@ -239,12 +269,13 @@ class Run:
     def save(self) -> None:
         """Checkpoint now."""
         if self.learner is not None:
-            spec = dataclasses.asdict(self.config.spec)
-            about = About(**dataclasses.asdict(self.position), files={}, network=spec)
+            about = About(**dataclasses.asdict(self.position), files={}, network=self._network)
             whole = gather(self.learner._replace(key=jax.random.key_data(self.learner.key)))
+            # Where a phase ended stays too: other refinements can begin there.
+            ends = set(itertools.accumulate(phase.updates for _, phase in self.config.phases))
             best = record.best(self.metrics.rows)
             self.last_good = checkpoints.save(self.folder, whole, about,
-                                              best["total_updates"] if best else None)
+                                              ends | ({best["total_updates"]} if best else set()))
         self.last_saved = time.monotonic()
 
     def finish(self) -> dict[str, Any]:

@@ -88,6 +88,11 @@ def read(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def copy(source: Path, target: Path) -> None:
+    """The rows of one metrics file into another; of none, no rows."""
+    files.write_text(target, "".join(files.dump_json(row) + "\n" for row in read(source)))
+
+
 STANDING = 0.5
 """Success from which on a policy counts as one that can be lost."""
 PATIENCE = 3

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -293,7 +294,7 @@ def test_a_collapse_ends_the_command_with_one_unless_told_otherwise(tmp_path, mo
     assert main(words(tmp_path / "b", *often, "--no-stop-on-collapse")) == 0
     assert (tmp_path / "b" / "report.json").exists()
     kept = [path.name for path in sorted((tmp_path / "b" / "checkpoints").iterdir())]
-    assert kept == ["00000002", "00000006", "00000008", "00000010"]
+    assert kept == ["00000002", "00000004", "00000006", "00000008", "00000010"]
 
 
 def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
@@ -302,6 +303,51 @@ def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
         Run(TINY, tmp_path, resume=False)
     with pytest.raises(InputError, match="gamma: was started with other numbers"):
         Run(dataclasses.replace(TINY, gamma=0.9), tmp_path, resume=True)
+
+
+def test_beginning_where_another_runs_bootstrap_ended(whole, tmp_path):
+    """The same numbers end with the same bits; others change what comes after, and only that."""
+    end = whole.out / "checkpoints" / "00000004"
+    twin = Run(TINY, tmp_path / "twin", resume=False, begin=end)
+    assert twin.position.total_updates == 4
+    assert (tmp_path / "twin/checkpoints/00000004").is_dir()
+    assert twin.train(Stop())
+    assert same(bits(twin), bits(whole))
+    rows = [record.read(run.out / "metrics.jsonl") for run in (twin, whole)]
+    assert [r["success"] for r in rows[0]] == [r["success"] for r in rows[1]]
+
+    weights = dataclasses.replace(REFINEMENT, AR=0.0)
+    refinement = dataclasses.replace(TINY.refinement, weights=weights)
+    quick = dataclasses.replace(TINY, refinement=refinement)
+    other = Run(quick, tmp_path / "other", resume=False, begin=end)
+    assert same(bits(other), bits(Run(TINY, tmp_path / "start", resume=False, begin=end)))
+    other.train(Stop(), stop_after=6)
+    assert (tmp_path / "other/checkpoints/00000004").is_dir()
+    again = Run(quick, tmp_path / "other", resume=True)
+    assert again.train(Stop())
+    assert not same(bits(again), bits(whole))
+
+
+
+def test_what_a_run_may_not_begin_with_is_one_line_and_leaves_nothing(whole, tmp_path, capsys):
+    end = whole.out / "checkpoints" / "00000004"
+    torn = tmp_path / "torn"
+    shutil.copytree(end, torn)
+    largest = max((p for p in torn.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[:-7])
+    for place, more, line in (
+            (tmp_path / "none", (), "none: is no whole checkpoint"),
+            (torn, (), "torn: is no whole checkpoint (its checksums do not match)"),
+            (end, ("--width", "16"), "is of another network"),
+            (end, ("--bootstrap.num-envs", "4"), "another network"),
+            (end, ("--bootstrap.updates", "2"), "bootstrap.updates: stands after 4 updates"),
+            (end, ("--resume",), "--begin: is for a new run")):
+        out = tmp_path / "out"
+        assert main(words(out, "--begin", str(place), *more)) == 2
+        found = capsys.readouterr().err
+        assert line in found
+        assert found.count("\n") == 1
+        assert not out.exists()
 
 
 def test_a_checkpoint_of_another_network_is_refused(tmp_path):
