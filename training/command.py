@@ -28,7 +28,8 @@ COMPARE = "compare"
 
 @dataclass(frozen=True)
 class Args:
-    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's), small.
+    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's),
+    small and laptop (for two cores).
 
     The presets quick and any_team imitate the exact planner instead, for teams of any size, and
     refine goes on from there by MAPPO; they have options of their own: moonteam train quick --help.

@@ -21,7 +21,7 @@ DECODES = ("argmax", "sample")
 
 @dataclass(frozen=True)
 class Args:
-    """Put run folders of `moonteam train` (presets small and pi_*) side by side.
+    """Put run folders of `moonteam train` (presets small, laptop and pi_*) side by side.
 
     Runs that differ only in their seed are one row: the mean over seeds, in brackets the lowest
     and the highest. A row is named by what its numbers differ in from the first of its preset,
@@ -129,7 +129,8 @@ def read(folder: Path) -> Trained:
     """A run folder. Raises InputError if it holds no MAPPO run, or one without an evaluation."""
     config = files.read_json(folder / "config.json", dict[str, Any])
     if not isinstance(config.get("name"), str) or not isinstance(config.get("seed"), int):
-        raise InputError(folder, "is no run of the presets small or pi_*; only those are compared")
+        raise InputError(folder, "is no run of the presets small, laptop or pi_*; only those "
+                         "are compared")
     metrics = folder / "metrics.jsonl"
     rows = record.read(metrics)
     checked = files.convert(rows, list[Row], metrics)
