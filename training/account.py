@@ -22,10 +22,15 @@ from training.grid_task import GridTask
 GIB = 2**30
 
 
-def describe(config: Config) -> dict[str, Any]:
-    """The dry run's document: the run's numbers, and what they add up to."""
+def describe(config: Config, compiled: bool = False) -> dict[str, Any]:
+    """The dry run's document: the run's numbers, and what they add up to.
+
+    `compiled` adds what XLA sets aside, for which both phases are compiled.
+    """
     params = jax.eval_shape(lambda: recurrent.init(config.spec, jax.random.key(0)))
     phases = {name: phase_account(config, phase) for name, phase in config.phases}
+    for name, phase in config.phases if compiled else ():
+        phases[name]["compiled_bytes"] = compiled_bytes(config, phase)
     return {
         "config": dataclasses.asdict(config), "phases": phases,
         "h100": {p: roofline(config, list(phases.values()), p) for p in PEAK_FLOPS},
@@ -60,9 +65,9 @@ def memory(config: Config, phase: Phase) -> dict[str, int]:
     """Bytes of each large buffer, each counted in full as if none were ever reused.
 
     rollout: what collection stores. targets: advantages, value targets and next values.
-    minibatch: one gathered part with the activations that its gradient keeps, of the larger
-    network (the two are differentiated one after the other). learner: parameters, gradients,
-    both Adam moments, environment states, memory.
+    minibatch: one gathered part with the activations that its gradient keeps, of both networks,
+    since nothing makes one wait for the other. learner: parameters, gradients, both Adam moments,
+    environment states, memory.
     """
     nets = networks.for_spec(config.spec, config.precision)
     task, hyper = GridTask(config.env(phase)), config.hyper(phase)
@@ -73,17 +78,35 @@ def memory(config: Config, phase: Phase) -> dict[str, int]:
     stored = _bytes(batch)
     scalars = 4 * config.num_steps * phase.num_envs * config.num_agents
     rows = config.num_steps * phase.num_envs // phase.num_minibatches * config.num_agents
-    kept = rows * 4 * (config.spec.obs_size * config.num_agents + ACTIVATIONS * config.width)
+    inputs = config.spec.obs_size * (1 + config.num_agents)
+    kept = rows * 4 * (inputs + 2 * ACTIVATIONS * config.width)
     parts = {"rollout": stored, "targets": 4 * scalars,
              "minibatch": (stored + 4 * scalars) // phase.num_minibatches + kept,
              "learner": 2 * _bytes(learner)}
     return parts | {"total": sum(parts.values())}
 
 
-ACTIVATIONS = 20
-"""Width-sized float32 arrays a row that the gradient of one network keeps or makes: embedding
-(2), gates (3), recurrent products (3), r, z, n, output (4), mix (2), and the gradients of the
-largest three of these (6)."""
+ACTIVATIONS = 18
+"""Width-sized float32 arrays a row at the height of one network's gradient. Kept from the way
+forth: embedding (2), memory before, r, z, n and the candidate's product (5), output (1), mix (2).
+Made on the way back: the gradients of the output (1), of the recurrent products (3), of n (1) and
+of the gates (3)."""
+
+
+def compiled_bytes(config: Config, phase: Phase) -> int:
+    """What XLA sets aside for a chunk of updates on one device of this machine.
+
+    Compiles the chunk, runs nothing and allocates nothing: arguments, results and everything
+    between, as its buffer assignment has it.
+    """
+    nets = networks.for_spec(config.spec, config.precision)
+    task, hyper = GridTask(config.env(phase)), config.hyper(phase)
+    learner = jax.eval_shape(
+        lambda: update.begin(nets, task, hyper, phase.num_envs, jax.random.key(0)))
+    with networks.matmul_precision(config.precision):
+        found = update.compiled(nets, task, hyper, learner, config.chunk_updates).memory_analysis()
+    return (found.argument_size_in_bytes + found.output_size_in_bytes
+            - found.alias_size_in_bytes + found.temp_size_in_bytes)
 
 
 PEAK_FLOPS = {"float32": 66.9e12, "tf32": 494.7e12, "bfloat16": 989.4e12}
@@ -155,6 +178,9 @@ def _rows(config: Config, table: dict[str, Any]) -> list[tuple[str, list[str]]]:
     for part in accounts[0]["memory_bytes"]:
         rows.append((f"memory: {part}, GiB",
                      [f"{a['memory_bytes'][part] / GIB:.3f}" for a in accounts]))
+    if "compiled_bytes" in accounts[0]:
+        rows.append((f"set aside by XLA ({jax.default_backend()}), GiB",
+                     [f"{a['compiled_bytes'] / GIB:.3f}" for a in accounts]))
     return rows
 
 

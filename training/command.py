@@ -42,7 +42,7 @@ class Args:
       moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50
       moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50 --resume
       moonteam train small --begin runs/small-0/checkpoints/00001000 --refinement.lr 1e-3
-      moonteam train pi_5t --dry-run
+      moonteam train pi_5t --dry-run --compiled
     """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -70,6 +70,9 @@ class Args:
     """Number of this one, from 0; others than 0 write to OUT/process-N."""
     dry_run: bool = False
     """Print the numbers, totals, memory and work, train nothing."""
+    compiled: bool = False
+    """With --dry-run: also compile both phases, without running them, and print what memory XLA
+    sets aside for them."""
     json: bool = False
     """One JSON document on standard output: the report, or the dry run's table."""
 
@@ -115,7 +118,7 @@ def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
     if args.dry_run:
         from training import account
 
-        table = account.describe(args.config)
+        table = account.describe(args.config, args.compiled)
         print(files.dump_json(table, 2) if args.json else account.as_text(args.config, table))
         return 0
     return _train(args)

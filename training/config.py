@@ -189,7 +189,7 @@ PRESETS = {
         update_epochs=2, gamma=0.95, chunk_updates=10, eval_every=5),
     "laptop": Config(
         "laptop", Phase(4500, 512, 8, BOOTSTRAP), Phase(4500, 512, 8, REFINEMENT, ent_coef=0.003),
-        size=(12, 12), max_steps=72, num_steps=32, width=64, approach_decay=0.2,
+        size=(10, 10), max_steps=64, num_steps=32, width=64, approach_decay=0.25,
         update_epochs=2, gamma=0.97, chunk_updates=30, eval_every=5),
 }
 """`pi_5t5r` takes the five-target figures: the paper lists none of its own."""

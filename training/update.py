@@ -153,6 +153,12 @@ _several = jax.jit(several, static_argnames=("networks", "task", "hyper", "count
                    donate_argnames="learner")
 
 
+def compiled(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
+             count: int) -> jax.stages.Compiled:
+    """`chunk` compiled on one device and not run; `learner` may be shapes alone."""
+    return _several.lower(networks, task, hyper, learner, count).compile()
+
+
 def chunk(networks: Networks, task: Task, hyper: Hyper, learner: Learner,
           count: int) -> tuple[Learner, Report]:
     """`several` in one call, on the devices that the learner is spread over; donates it."""
