@@ -188,8 +188,8 @@ PRESETS = {
         num_targets=3, size=(8, 8), max_steps=48, num_steps=24, width=64, approach_decay=0.3,
         update_epochs=2, gamma=0.95, chunk_updates=10, eval_every=5),
     "laptop": Config(
-        "laptop", Phase(3000, 512, 8, BOOTSTRAP, lr=2.5e-3),
-        Phase(3000, 512, 8, REFINEMENT, lr=2e-3, ent_coef=0.003),
+        "laptop", Phase(2400, 512, 8, BOOTSTRAP, lr=2.5e-3),
+        Phase(2400, 512, 8, REFINEMENT, lr=2e-3, ent_coef=0.003),
         num_targets=3, size=(16, 16), max_steps=96, num_steps=32, width=64, approach_decay=0.15,
         update_epochs=2, gamma=0.96, chunk_updates=30, eval_every=5),
 }
