@@ -225,7 +225,8 @@ def notes(groups: dict[str, list[Trained]]) -> list[str]:
 
 
 def _listed(values: list[Any]) -> str:
-    if len(values) > 2 and values == list(range(values[0], values[0] + len(values))):
+    whole = len(values) > 2 and all(isinstance(value, int) for value in values)
+    if whole and values == list(range(values[0], values[0] + len(values))):
         return f"{values[0]} to {values[-1]}"
     return ", ".join(map(str, values))
 
