@@ -77,7 +77,7 @@ def test_the_notes_name_seeds_and_unfinished_runs(runs, capsys):
     assert "GRU: 0 to 2; Dense: 0, 1." in notes
     assert f"{runs[4]} is not finished: its last evaluation, on 256 scenarios after 400" in notes
     assert runs[3] not in notes
-    assert "On 500 scenarios at the end of training; trained at commit abc0, abc1, abc2 on 1 x cpu" in notes
+    assert "On 500 scenarios at the end of training; trained at commit abc0, abc1, abc2 on" in notes
 
 
 def test_tables_and_curves(runs, tmp_path, capsys):
