@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from moonteam.errors import InputError
 from moonteam.policies import recurrent
 from training import networks, rollout, update
 from training.config import Config, Phase
@@ -97,7 +98,7 @@ def compiled_bytes(config: Config, phase: Phase) -> int:
     """What XLA sets aside for a chunk of updates on one device of this machine.
 
     Compiles the chunk, runs nothing and allocates nothing: arguments, results and everything
-    between, as its buffer assignment has it.
+    between, as its buffer assignment has it. Raises InputError where XLA does not say.
     """
     nets = networks.for_spec(config.spec, config.precision)
     task, hyper = GridTask(config.env(phase)), config.hyper(phase)
@@ -105,6 +106,9 @@ def compiled_bytes(config: Config, phase: Phase) -> int:
         lambda: update.begin(nets, task, hyper, phase.num_envs, jax.random.key(0)))
     with networks.matmul_precision(config.precision):
         found = update.compiled(nets, task, hyper, learner, config.chunk_updates).memory_analysis()
+    if found is None:
+        raise InputError("--compiled", "XLA does not say what it sets aside on "
+                         f"{jax.default_backend()}; leave it out")
     return (found.argument_size_in_bytes + found.output_size_in_bytes
             - found.alias_size_in_bytes + found.temp_size_in_bytes)
 
