@@ -19,6 +19,9 @@ from moonteam.policies import recurrent
 from training import networks, rollout, update
 from training.config import Config, Phase
 from training.grid_task import GridTask
+from training.hyper import Hyper
+from training.networks import Networks
+from training.update import Learner
 
 GIB = 2**30
 
@@ -70,10 +73,7 @@ def memory(config: Config, phase: Phase) -> dict[str, int]:
     since nothing makes one wait for the other. learner: parameters, gradients, both Adam moments,
     environment states, memory.
     """
-    nets = networks.for_spec(config.spec, config.precision)
-    task, hyper = GridTask(config.env(phase)), config.hyper(phase)
-    learner = jax.eval_shape(
-        lambda: update.begin(nets, task, hyper, phase.num_envs, jax.random.key(0)))
+    nets, task, _, learner = _shapes(config, phase)
     batch = jax.eval_shape(lambda held: rollout.collect(
         nets, task, held.params, held.carry, jax.random.key(0), config.num_steps)[1], learner)
     stored = _bytes(batch)
@@ -100,17 +100,31 @@ def compiled_bytes(config: Config, phase: Phase) -> int:
     Compiles the chunk, runs nothing and allocates nothing: arguments, results and everything
     between, as its buffer assignment has it. Raises InputError where XLA does not say.
     """
-    nets = networks.for_spec(config.spec, config.precision)
-    task, hyper = GridTask(config.env(phase)), config.hyper(phase)
-    learner = jax.eval_shape(
-        lambda: update.begin(nets, task, hyper, phase.num_envs, jax.random.key(0)))
+    nets, task, hyper, learner = _shapes(config, phase)
     with networks.matmul_precision(config.precision):
-        found = update.compiled(nets, task, hyper, learner, config.chunk_updates).memory_analysis()
+        found = set_aside(update.compiled(nets, task, hyper, learner, config.chunk_updates))
     if found is None:
         raise InputError("--compiled", "XLA does not say what it sets aside on "
                          f"{jax.default_backend()}; leave it out")
-    return (found.argument_size_in_bytes + found.output_size_in_bytes
-            - found.alias_size_in_bytes + found.temp_size_in_bytes)
+    return found
+
+
+def set_aside(program: jax.stages.Compiled) -> int | None:
+    """Bytes of a program's arguments, results and all between, what it is donated counted once;
+    None where XLA does not say.
+    """
+    found = program.memory_analysis()
+    return None if found is None else (
+        found.argument_size_in_bytes + found.output_size_in_bytes
+        - found.alias_size_in_bytes + found.temp_size_in_bytes)
+
+
+def _shapes(config: Config, phase: Phase) -> tuple[Networks, GridTask, Hyper, Learner]:
+    """What the learner of a phase is made of, itself as shapes alone."""
+    nets = networks.for_spec(config.spec, config.precision)
+    task, hyper = GridTask(config.env(phase)), config.hyper(phase)
+    return nets, task, hyper, jax.eval_shape(
+        lambda: update.begin(nets, task, hyper, phase.num_envs, jax.random.key(0)))
 
 
 PEAK_FLOPS = {"float32": 66.9e12, "tf32": 494.7e12, "bfloat16": 989.4e12}

@@ -176,15 +176,13 @@ def compiled(work: Callable[[Any], Any], held: Any, spread: Any = None) -> tuple
     """
     import jax
 
-    from training import sharding
+    from training import account, sharding
 
     with sharding.mesh_of(jax.numpy.zeros(()) if spread is None else spread):
         start = time.perf_counter()
         program = jax.jit(work).lower(held).compile()
         took = time.perf_counter() - start
-    memory = program.memory_analysis()
-    return program, took, sum(getattr(memory, f"{kind}_size_in_bytes", 0)
-                                 for kind in ("argument", "output", "temp"))
+    return program, took, account.set_aside(program) or 0
 
 
 def timed(work: Callable[[Any], Any], begin: Callable[[], Learner],

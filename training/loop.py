@@ -101,13 +101,11 @@ class Run:
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
         self.mesh = mesh_for(p.num_envs // p.num_minibatches for _, p in config.phases)
         self.folder = out / "checkpoints"
-        found = self._find(resume) if begin is None else self._begun(begin, resume)
-        self.position, arrays = found
+        self.position, arrays = (self._find(resume) if begin is None
+                                 else self._begun(begin, resume))
         self.learner = self._resumed(arrays)
-        if begin is not None:  # what the other run recorded until then
-            record.copy(begin.parent.parent / "metrics.jsonl", out / "metrics.jsonl")
         self.metrics = record.Metrics(out / "metrics.jsonl", self.position.total_updates,
-                                      tensorboard)
+                                      tensorboard, begin and begin.parent.parent / "metrics.jsonl")
         self.last_saved = time.monotonic()
         self.last_good = checkpoints.newest(self.folder)
         if begin is not None:

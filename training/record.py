@@ -26,14 +26,17 @@ class Metrics:
     `close` at the end.
     """
 
-    def __init__(self, path: Path, resumed_updates: int, tensorboard: bool = False):
+    def __init__(self, path: Path, resumed_updates: int, tensorboard: bool = False,
+                 earlier: Path | None = None):
         """Keeps the lines of an earlier stretch up to `resumed_updates`, drops later ones.
 
+        `earlier`: where that stretch is, if in another file.
         Raises InputError if TensorBoard is asked for and its writer is not installed.
         """
         writer = tensorboard_writer() if tensorboard else None
         self.path, self.events = path, None
-        self.rows = [row for row in read(path) if row["total_updates"] <= resumed_updates]
+        self.rows = [row for row in read(earlier or path)
+                     if row["total_updates"] <= resumed_updates]
         files.write_text(path, "".join(files.dump_json(row) + "\n" for row in self.rows))
         if writer:
             done = self.rows[-1]["env_steps"] if self.rows else 0
@@ -86,11 +89,6 @@ def read(path: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return rows
-
-
-def copy(source: Path, target: Path) -> None:
-    """The rows of one metrics file into another; of none, no rows."""
-    files.write_text(target, "".join(files.dump_json(row) + "\n" for row in read(source)))
 
 
 STANDING = 0.5

@@ -328,7 +328,6 @@ def test_beginning_where_another_runs_bootstrap_ended(whole, tmp_path):
     assert not same(bits(again), bits(whole))
 
 
-
 def test_what_a_run_may_not_begin_with_is_one_line_and_leaves_nothing(whole, tmp_path, capsys):
     end = whole.out / "checkpoints" / "00000004"
     torn = tmp_path / "torn"

@@ -179,12 +179,8 @@ def show_plain(document: dict, tables: Sequence[tuple[list[str], list[list[str]]
 def print_plain(args: Any, document: dict,
                 tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
     """The document as `--json` or `--markdown` ask for it, else its tables for a person."""
-    if args.json:
-        print(files.dump_json(document))
-    elif args.markdown:
-        print(plain_markdown(document, tables))
-    else:
-        show_plain(document, tables)
+    print_as(args, document, lambda: plain_markdown(document, tables),
+             lambda: show_plain(document, tables))
 
 
 def print_columns(args: Any, document: dict, page: Sequence[Column],
@@ -192,12 +188,18 @@ def print_columns(args: Any, document: dict, page: Sequence[Column],
     """The document as `--json` or `--markdown` (with the columns of the `page`) ask for it, else
     with all its columns for a person.
     """
+    print_as(args, document, lambda: markdown(document, page), lambda: show(document, columns))
+
+
+def print_as(args: Any, document: dict, page: Callable[[], str],
+             person: Callable[[], object]) -> None:
+    """`--json` prints the document, `--markdown` the page; else `person` shows it."""
     if args.json:
         print(files.dump_json(document))
     elif args.markdown:
-        print(markdown(document, page))
+        print(page())
     else:
-        show(document, columns)
+        person()
 
 
 def plain_csv(rows: Sequence[dict]) -> str:
