@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.scenario import Cell
-from sim2grid.frames import Frame
+from moonteam.problem.scenario import Cell
+from sim2grid.frame import Frame
 
 SLOTS = 0.22 * np.array([[-1, -1], [1, 1], [-1, 1], [1, -1]])
 """Places [4, 2] of robots that share a cell, in cells from its centre."""

@@ -15,10 +15,10 @@ from moonteam import __version__
 from moonteam.errors import InputError
 
 COMMANDS = {
-    "train": ("training.command", "train a grid policy from a preset"),
+    "train": ("training.commands.train", "train a grid policy from a preset"),
     "plan": ("moonteam.commands.plan", "plan a scenario and print the schedule"),
     "replay": ("moonteam.commands.replay", "the grid env's trace of a list of actions"),
-    "rollout": ("sim2grid.command", "run a mission in physics: video and report"),
+    "rollout": ("sim2grid.commands.rollout", "run a mission in physics: video and report"),
     "evaluate grid": ("moonteam.commands.evaluate_grid", "planners side by side on a set"),
     "evaluate sets": (
         "moonteam.commands.evaluate_sets", "one policy over all bundled sets, one row a set"),
@@ -26,9 +26,11 @@ COMMANDS = {
         "moonteam.commands.evaluate_replanning", "5 + 5 targets, new ones while under way"),
     "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),
     "evaluate execution": (
-        "sim2grid.evaluate_command", "many missions in physics: success, cost and failures"),
+        "sim2grid.commands.evaluate_execution",
+        "many missions in physics: success, cost and failures"),
     "evaluate sensitivity": (
-        "sim2grid.sensitivity_command", "success and seconds against slope, friction, noise"),
+        "sim2grid.commands.evaluate_sensitivity",
+        "success and seconds against slope, friction, noise"),
     "evaluate preference": (
         "moonteam.commands.evaluate_preference", "a policy's trade-off of time and effort"),
     "evaluate traverse": (
@@ -38,9 +40,9 @@ COMMANDS = {
     "export": ("moonteam.commands.export", "a policy as an ONNX file that runs without JAX"),
     "site": ("moonteam.commands.site", "make, import and preview lunar terrain"),
     "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
-    "bench train": ("training.bench", "training throughput"),
+    "bench train": ("training.commands.bench_train", "training throughput"),
     "bench physics": ("moonteam.commands.bench_physics", "physics steps per second"),
-    "bench execution": ("sim2grid.bench_command", "missions in physics per second"),
+    "bench execution": ("sim2grid.commands.bench_execution", "missions in physics per second"),
     "testsets": ("moonteam.commands.testsets", "make the scenario sets, with their optima"),
     "doctor": ("moonteam.commands.doctor", "what this machine can do"),
 }

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from moonteam.cli import main
-from moonteam.evaluation import env_speed, timing
 from moonteam.evaluation.contenders import Planned
-from moonteam.policies import checkpoint, entity, recurrent
+from moonteam.evaluation.speed import env_speed, timing
+from moonteam.policies import entity, policy_file, recurrent
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.recurrent import RecurrentSpec
 
@@ -38,7 +38,7 @@ def policy(tmp_path_factory):
     params = jax.tree.map(lambda x: rng.normal(0, 0.5, x.shape).astype(np.float32), shapes)
     path = tmp_path_factory.mktemp("policy") / "tiny.safetensors"
     config = {"num_agents": 3, "num_targets": 5, "size": [32, 32], "width": 8}
-    checkpoint.save_policy(path, checkpoint.PolicyFile("recurrent", config, params))
+    policy_file.save_policy(path, policy_file.PolicyFile("recurrent", config, params))
     return str(path)
 
 
@@ -52,7 +52,7 @@ def any_team(tmp_path_factory):
     params["stay"]["bias"] -= 5.0
     path = tmp_path_factory.mktemp("policy") / "any.safetensors"
     config = {"width": 8, "heads": 2, "layers": 1}
-    checkpoint.save_policy(path, checkpoint.PolicyFile("entity", config, params))
+    policy_file.save_policy(path, policy_file.PolicyFile("entity", config, params))
     return str(path)
 
 

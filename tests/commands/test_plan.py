@@ -8,7 +8,7 @@ from moonteam import cli, files
 from moonteam.commands import plan as command
 from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
-from moonteam.scenario import ACTIONS, Agent, Scenario, Target, save_set
+from moonteam.problem.scenario import ACTIONS, Agent, Scenario, Target, save_set
 
 TEAM = Scenario(
     id="pair", size=(8, 6), agents=(Agent((0, 0), ("A",)), Agent((7, 0), ("B",))),

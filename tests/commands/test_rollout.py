@@ -9,7 +9,8 @@ from moonteam.cli import main
 from moonteam.physics import backends, render
 from moonteam.physics.backends import NativeBackend
 from moonteam.physics.render import RenderingUnavailable
-from sim2grid import film, prepare
+from sim2grid.loop import prepare
+from sim2grid.show import film
 
 GOOD = """
 map: {size: [3, 3], cell_m: 1.0}

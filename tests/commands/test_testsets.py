@@ -6,13 +6,13 @@ import pytest
 
 from moonteam import cli, paths
 from moonteam.commands.testsets import NAMES
-from moonteam.planners import bounds
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
-from moonteam.planners.large import LnsPlanner
-from moonteam.planners.task import Task
-from moonteam.planners.travel import travel_times
-from moonteam.scenario import Optimal, load_set
+from moonteam.planners.lns import LnsPlanner
+from moonteam.planners.search import bounds
+from moonteam.planners.search.task import Task
+from moonteam.planners.search.travel import travel_times
+from moonteam.problem.scenario import Optimal, load_set
 
 FOLDER = paths.assets() / "testsets"
 INDEX = json.loads((FOLDER / "index.json").read_text())

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from moonteam.evaluation import metrics, optima
-from moonteam.evaluation.bootstrap import Bootstrap
 from moonteam.evaluation.metrics import Family, Outcomes, Reference
-from moonteam.scenario import Agent, Optimal, Scenario, Target
+from moonteam.problem.scenario import Agent, Optimal, Scenario, Target
+from moonteam.report.intervals import Bootstrap
 
 FAMILY = Family(("a", "b", "c", "d"), np.full(4, 128), np.full(4, 3))
 REFERENCE = Reference(np.array([30.0, 40.0, 50.0, 60.0]), np.array([60.0, 70.0, 80.0, 90.0]))

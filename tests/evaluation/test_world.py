@@ -5,21 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from moonteam import scenario as files
 from moonteam.errors import InputError
 from moonteam.evaluation import replanning, rollouts
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Options, Planned, contenders
-from moonteam.evaluation.decode import parse
 from moonteam.evaluation.draw import Draw
 from moonteam.grid import env
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.scenarios import generate, to_problem
 from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
+from moonteam.planners.decode import parse
 from moonteam.planners.learned import LearnedPlanner, Policy
-from moonteam.policies import checkpoint, recurrent
+from moonteam.policies import policy_file, recurrent
 from moonteam.policies.recurrent import RecurrentSpec
+from moonteam.problem import scenario as files
 
 GOLDEN = "tests/golden/certified_optima.jsonl"
 
@@ -117,7 +117,7 @@ def policy(tmp_path_factory):
     shapes = jax.eval_shape(lambda key: recurrent.init(spec, key), jax.random.key(0))
     rng = np.random.default_rng(1)
     params = jax.tree.map(lambda x: rng.normal(0, 0.5, x.shape).astype(np.float32), shapes)
-    checkpoint.save_policy(path, checkpoint.PolicyFile("recurrent", config, params))
+    policy_file.save_policy(path, policy_file.PolicyFile("recurrent", config, params))
     return Policy.load(path)
 
 

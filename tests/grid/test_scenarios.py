@@ -9,10 +9,11 @@ import jax
 import numpy as np
 import pytest
 
-from moonteam import grid, scenario
+from moonteam import grid
 from moonteam.errors import InputError
 from moonteam.grid.scenarios import reachable
 from moonteam.planners import base
+from moonteam.problem import scenario
 
 CERTIFIED = Path(__file__).parents[1] / "golden" / "certified_optima.jsonl"
 KINDS = {"drone": 0.0, "legged": 0.15, "wheeled": 0.4}

@@ -11,7 +11,7 @@ import pytest
 from moonteam import grid
 from moonteam.grid.config import EnvConfig
 from moonteam.planners.base import Snapshot
-from moonteam.scenario import load_set
+from moonteam.problem.scenario import load_set
 
 STEPS, AGENTS, TARGETS = 128, 4, 12  # one shape, so that the environment is compiled once
 

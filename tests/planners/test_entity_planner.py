@@ -11,8 +11,8 @@ from moonteam.planners import learned, simulate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
 from moonteam.policies import entity
-from moonteam.policies.checkpoint import PolicyFile, save_policy
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.policy_file import PolicyFile, save_policy
 
 SPEC = EntitySpec(width=16, heads=2, layers=1)
 

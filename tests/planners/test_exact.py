@@ -13,9 +13,9 @@ from moonteam.planners import exact, simulate
 from moonteam.planners.base import Planner, Snapshot, Visit
 from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.greedy import GreedyPlanner
-from moonteam.planners.large import LnsPlanner
-from moonteam.planners.task import value_of
-from moonteam.scenario import Agent, Scenario, Target
+from moonteam.planners.lns import LnsPlanner
+from moonteam.planners.search.task import value_of
+from moonteam.problem.scenario import Agent, Scenario, Target
 
 GROUND = {"drone": 0.0, "legged": 0.15, "wheeled": 0.3}
 

@@ -9,9 +9,9 @@ from moonteam.planners import learned, simulate
 from moonteam.planners.base import Planner, Snapshot
 from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
 from moonteam.policies import recurrent
-from moonteam.policies.checkpoint import PolicyFile, load_policy, save_policy
+from moonteam.policies.policy_file import PolicyFile, load_policy, save_policy
 from moonteam.policies.recurrent import RecurrentSpec
-from moonteam.scenario import Agent, Scenario, Target
+from moonteam.problem.scenario import Agent, Scenario, Target
 
 SPEC = RecurrentSpec(num_agents=2, num_targets=2, size=(4, 4), width=8)
 SCENARIO = Scenario(

@@ -14,8 +14,8 @@ from moonteam.planners.batch import solve_batch
 from moonteam.planners.cpsat import CpSatPlanner
 from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.exhaustive import ExhaustivePlanner
-from moonteam.planners.search import segment_table, suffix_table
-from moonteam.planners.task import value_of
+from moonteam.planners.search.schedules import segment_table, suffix_table
+from moonteam.planners.search.task import value_of
 
 GROUND = {"drone": 0.0, "legged": 0.15, "wheeled": 0.3}
 OBJECTIVES = ("makespan", "moves", "weighted")

@@ -11,8 +11,8 @@ from moonteam import grid
 from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
-from moonteam.planners.rollout import plan_from_planner
-from moonteam.planners.travel import travel_times, walk
+from moonteam.planners.plans.stepwise import plan_from_planner
+from moonteam.planners.search.travel import travel_times, walk
 
 GROUND = {"drone": 0.0, "legged": 0.2, "wheeled": 0.4}
 

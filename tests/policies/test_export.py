@@ -16,9 +16,10 @@ from moonteam.grid import scenarios
 from moonteam.planners import learned
 from moonteam.planners.base import Snapshot
 from moonteam.planners.learned import LearnedPlanner, Policy
-from moonteam.policies import entity, onboard, recurrent
-from moonteam.policies.checkpoint import PolicyFile, save_policy
+from moonteam.policies import entity, recurrent
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.export import onboard
+from moonteam.policies.policy_file import PolicyFile, save_policy
 from moonteam.policies.recurrent import RecurrentSpec
 
 SPEC = EntitySpec(width=16, heads=2, layers=2)

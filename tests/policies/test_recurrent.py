@@ -6,7 +6,7 @@ from flax import linen as nn
 
 from moonteam.errors import InputError
 from moonteam.policies import recurrent
-from moonteam.policies.checkpoint import PolicyFile, check_shapes, load_policy, save_policy
+from moonteam.policies.policy_file import PolicyFile, check_shapes, load_policy, save_policy
 from moonteam.policies.recurrent import Gru, RecurrentSpec
 
 PAPER = RecurrentSpec(num_agents=3, num_targets=5, size=(32, 32))

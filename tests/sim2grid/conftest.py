@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from moonteam import mission as missions
+from moonteam.problem import mission as missions
+from moonteam.problem.scenario import ACTIONS
 from moonteam.robots.base import CONTROL_PERIOD
-from moonteam.scenario import ACTIONS
-from sim2grid.drive import run
-from sim2grid.execute import Body, Execution
-from sim2grid.frames import Frame
-from sim2grid.replan import grid_problem
+from sim2grid.frame import Frame
+from sim2grid.loop.drive import run
+from sim2grid.loop.execution import Body, Execution
+from sim2grid.loop.replan import grid_problem
 
 
 @dataclass

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2grid.frames import Frame
+from sim2grid.frame import Frame
 from sim2grid.waypoints import LANE, crowds, waypoints, yielding
 
 FRAME = Frame((5, 5), 2.0)

@@ -5,8 +5,8 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
-from moonteam.mission import Map, Mission, Robot, Target
-from moonteam.mission import Site as MissionSite
+from moonteam.problem.mission import Map, Mission, Robot, Target
+from moonteam.problem.mission import Site as MissionSite
 from moonteam.terrain import generate
 from moonteam.terrain.measure import crater_counts, measure, poisson_interval, slope_map
 from moonteam.terrain.site import for_mission, import_dem, make_site

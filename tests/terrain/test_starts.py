@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from moonteam.cli import main
-from moonteam.mission import Map, Mission, Robot, Target
-from moonteam.mission import Site as MissionSite
+from moonteam.problem.mission import Map, Mission, Robot, Target
+from moonteam.problem.mission import Site as MissionSite
 from moonteam.terrain.site import for_mission
 from moonteam.terrain.traversability import boulder_distance, ground_under, limits_of
 

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from moonteam.physics import slopes
-from moonteam.physics.traverse import SAMPLE_SECONDS, run_traverses
+from moonteam.physics.trials import slopes
+from moonteam.physics.trials.traverse import SAMPLE_SECONDS, run_traverses
 from moonteam.robots import KINDS
 from moonteam.terrain.site import Boulder, Site, make_site
 from moonteam.terrain.traversability import (

@@ -59,9 +59,9 @@ def check(args: Args) -> None:
         raise InputError("--budget", f"{args.budget} is not allowed; above 0")
 
 
-def tables(document: dict) -> list[tuple[list[str], list[list[str]]]]:
+def as_tables(document: dict) -> list[tuple[list[str], list[list[str]]]]:
     """The two tables: titles and rows."""
-    from moonteam.evaluation.report import duration
+    from moonteam.report.tables import duration
 
     at = {(r["targets"], r["objective"], r["what"]): r for r in document["planner"]}
     kinds = list(dict.fromkeys((r["objective"], r["what"]) for r in document["planner"]))
@@ -82,7 +82,8 @@ def run(args: Args) -> int:
     """Measures, prints, saves."""
     check(args)
     compilation.enable_cache()
-    from moonteam.evaluation import env_speed, planner_speed, provenance, report
+    from moonteam.evaluation.speed import env_speed, planner_speed
+    from moonteam.report import provenance, tables
 
     command = command_line("bench grid", [], {
         "targets": args.targets, **{
@@ -104,7 +105,7 @@ def run(args: Args) -> int:
                 "meta": provenance.meta(command, args.seed)}
     if args.out:
         files.write_json(args.out / "bench.json", document)
-        text = report.plain_markdown(document, tables(document))
+        text = tables.plain_markdown(document, as_tables(document))
         files.write_text(args.out / "table.md", text + "\n")
-    report.print_plain(args, document, tables(document))
+    tables.print_plain(args, document, as_tables(document))
     return 0

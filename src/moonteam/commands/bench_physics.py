@@ -75,16 +75,16 @@ def run(args: Args) -> int:
         raise InputError("--threads", "each at least 1")
     compilation.enable_cache()
     compilation.call_at_once()
-    from moonteam.physics import bench
+    from moonteam.physics.trials import speed
 
-    scene = bench.three_robots(args.site, args.seed, args.samples)
+    scene = speed.three_robots(args.site, args.seed, args.samples)
     rows = []
     for name, batch, threads in _loads(args):
-        rows.append(bench.measure(scene, name, batch, args.seconds, threads))
+        rows.append(speed.measure(scene, name, batch, args.seconds, threads))
         if not (args.json or args.markdown):
             _show(rows[-1])
     site = ["--site", args.site, "--samples", str(args.samples), "--seed", str(args.seed)]
-    compiled = [bench.compile_times(name, 1, site)
+    compiled = [speed.compile_times(name, 1, site)
                 for name in dict.fromkeys(args.backend)] if args.compilation else []
     report = _document(args, scene, rows, compiled)
     if args.out is not None:
@@ -92,7 +92,7 @@ def run(args: Args) -> int:
     if args.json:
         print(files.dump_json(report))
     elif args.markdown:
-        from moonteam.evaluation.report import plain_markdown
+        from moonteam.report.tables import plain_markdown
 
         print(plain_markdown(report, tables(report)))
     else:
@@ -112,8 +112,8 @@ def _loads(args: Args) -> Iterator[tuple[str, int, int]]:
 
 
 def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) -> dict[str, Any]:
-    from moonteam.evaluation import provenance
-    from moonteam.physics import bench
+    from moonteam.physics.trials import speed
+    from moonteam.report import provenance
     from moonteam.robots.base import CONTROL_PERIOD
 
     default, words = Args(), ["moonteam", "bench", "physics"]
@@ -132,7 +132,7 @@ def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) 
         "Steps and real-time factor of all worlds together. CPU: processor seconds for one "
         "simulated second of one world. Memory: most that the process had so far."]
     return {
-        "title": "physics speed", "command": "bench physics", "device": bench.device_name(),
+        "title": "physics speed", "command": "bench physics", "device": speed.device_name(),
         "cpus": len(os.sched_getaffinity(0)), "site": args.site, "seed": args.seed,
         "samples": args.samples, "nv": model.nv, "dt": model.opt.timestep,
         "seconds": args.seconds, "boulders": len(sites.boulders), "rows": rows,

@@ -10,9 +10,10 @@ from typing import Any
 
 import tyro
 
-from moonteam import compilation, paths, scenario
+from moonteam import compilation, paths
 from moonteam.errors import InputError
-from moonteam.scenario import Scenario
+from moonteam.problem import scenario
+from moonteam.problem.scenario import Scenario
 
 Many = tyro.conf.UseAppendAction
 
@@ -79,7 +80,7 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for report.json, summary.csv, rows.csv, table.md and gaps.png."""
+    """Folder for tables.json, summary.csv, rows.csv, table.md and gaps.png."""
 
 
 def command_line(name: str, words: list[str], options: dict[str, object]) -> str:
@@ -150,12 +151,13 @@ def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
     `form` is the module that made it, with its COLUMNS, PAGE and PANELS; an interrupted report
     says on standard error what it lacks.
     """
-    from moonteam.evaluation import figures, report
+    from moonteam.evaluation import figures
+    from moonteam.report import tables
 
     if args.out:
-        report.save(args.out, document, form.PAGE)
+        tables.save(args.out, document, form.PAGE)
         figures.bars(args.out / picture, document, form.PANELS)
-    report.print_columns(args, document, form.PAGE, form.COLUMNS)
+    tables.print_columns(args, document, form.PAGE, form.COLUMNS)
     if "interrupted" not in document:
         return 0
     left = ", ".join(document["interrupted"])

@@ -41,7 +41,7 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for report.json, table.md and preference.png."""
+    """Folder for tables.json, table.md and preference.png."""
 
 
 def run(args: Args) -> int:
@@ -49,8 +49,10 @@ def run(args: Args) -> int:
     if args.points < 2:
         raise InputError("--points", f"{args.points} is not allowed; at least 2")
     compilation.enable_cache()
-    from moonteam.evaluation import decode, figures, preference, report
+    from moonteam.evaluation import figures, preference
+    from moonteam.planners import decode
     from moonteam.planners.learned import EntityBrain, Policy
+    from moonteam.report import tables
 
     how = decode.parse(args.decode)
     found = load_set(args.set, args.limit)
@@ -64,10 +66,10 @@ def run(args: Args) -> int:
     wishes = [round(i / (args.points - 1), 6) for i in range(args.points)]
     title = f"{Path(args.set).stem}: {len(found)} scenarios, preference from time to effort"
     document = preference.evaluate(found, policy, how, wishes, args.seed, title, command)
-    tables = [preference.pivot(document)]
+    shown = [preference.pivot(document)]
     if args.out:
-        files.write_json(args.out / "report.json", document)
-        files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
+        files.write_json(args.out / "tables.json", document)
+        files.write_text(args.out / "table.md", tables.plain_markdown(document, shown) + "\n")
         figures.preference(args.out / "preference.png", document)
-    report.print_plain(args, document, tables)
+    tables.print_plain(args, document, shown)
     return 0

@@ -10,7 +10,7 @@ import tyro
 from moonteam import compilation
 from moonteam.commands.evaluate_grid import Many, deliver, load_set, options_of, repeated
 from moonteam.errors import InputError
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
 
 
 @dataclass(frozen=True)

@@ -44,13 +44,13 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for report.json, summary.csv and table.md."""
+    """Folder for tables.json, summary.csv and table.md."""
 
 
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the policy achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.evaluation import provenance, report
+    from moonteam.report import provenance, tables
 
     found = [paths.find(name, "policies", ".safetensors") for name in args.policy or ("any_team",)]
     rows, left = [], [(name, path) for name in args.sets or _bundled() for path in found]
@@ -72,8 +72,8 @@ def run(args: Args) -> int:
         "meta": provenance.meta(" ".join(["moonteam evaluate sets", *words]), args.seed)}
     columns = _columns(args.best_of)
     if args.out:
-        report.save(args.out, document, columns)
-    report.print_columns(args, document, columns, columns)
+        tables.save(args.out, document, columns)
+    tables.print_columns(args, document, columns, columns)
     return 130 if left else 0
 
 
@@ -109,7 +109,7 @@ def _row(name: str, policy: Path, args: Args) -> dict:
 
 
 def _columns(best_of: int) -> tuple:
-    from moonteam.evaluation.report import Column, duration, percent
+    from moonteam.report.tables import Column, duration, percent
 
     def plain(value: float) -> str:
         return f"{value:.3f}"

@@ -54,7 +54,7 @@ def run(args: Args) -> int:
 
     enable_cache()
     call_at_once()
-    from moonteam.physics.slopes import measure
+    from moonteam.physics.trials.slopes import measure
     from moonteam.robots import KINDS
 
     rows = [row for kind in dict.fromkeys(args.kind) for roughness in args.roughness
@@ -105,7 +105,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 
 def _markdown(args: Args, rows: list[dict[str, Any]]) -> str:
-    from moonteam.evaluation import provenance
+    from moonteam.report import provenance
 
     def words(values: tuple[float, ...]) -> str:
         return " ".join(f"{v:g}" for v in values)

@@ -44,31 +44,33 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for report.json, timing.csv, table.md and timing.png."""
+    """Folder for tables.json, timing.csv, table.md and timing.png."""
 
 
 def run(args: Args) -> int:
     """Measures, prints, saves."""
-    from moonteam.evaluation import clock
+    from moonteam.report import clock
 
     with clock.one_core() as cores:
         document = _measured(args, cores)
-    from moonteam.evaluation import figures, report, timing
+    from moonteam.evaluation import figures
+    from moonteam.evaluation.speed import timing
+    from moonteam.report import tables
 
-    tables = [timing.pivot(document)]
+    shown = [timing.pivot(document)]
     if args.out:
-        files.write_json(args.out / "report.json", document)
-        files.write_text(args.out / "timing.csv", report.plain_csv(document["rows"]))
-        files.write_text(args.out / "table.md", report.plain_markdown(document, tables) + "\n")
+        files.write_json(args.out / "tables.json", document)
+        files.write_text(args.out / "timing.csv", tables.plain_csv(document["rows"]))
+        files.write_text(args.out / "table.md", tables.plain_markdown(document, shown) + "\n")
         figures.timing(args.out / "timing.png", document)
-    report.print_plain(args, document, tables)
+    tables.print_plain(args, document, shown)
     return 0
 
 
 def _measured(args: Args, cores: str) -> dict:
     """The report."""
     compilation.enable_cache()
-    from moonteam.evaluation import timing
+    from moonteam.evaluation.speed import timing
     from moonteam.planners.learned import Policy
 
     sizes = timing.Sizes(args.targets or (3, 4, 5, 6, 7, 8, 9, 10, 12), args.count, args.agents,

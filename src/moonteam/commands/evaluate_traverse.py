@@ -14,8 +14,8 @@ from moonteam.errors import InputError
 from moonteam.files import dump_json, replacing, write_json
 
 if TYPE_CHECKING:
-    from moonteam.physics.film import Shot
-    from moonteam.physics.traverse import Recording, Traverse
+    from moonteam.physics.trials.film import Shot
+    from moonteam.physics.trials.traverse import Recording, Traverse
 
 EXTENT = 26.0
 """Side of the sites beyond the length of a traverse, m."""
@@ -82,7 +82,7 @@ def run(args: Args) -> int:
 
     enable_cache()
     call_at_once()
-    from moonteam.physics.traverse import summarise
+    from moonteam.physics.trials.traverse import summarise
 
     summaries, rows, stills = [], [], []
     for kind in dict.fromkeys(args.kind):
@@ -95,7 +95,7 @@ def run(args: Args) -> int:
         write_json(args.out / "traverse.json", report)
         _write_csv(args.out / "traverse.csv", rows)
         if stills:
-            from moonteam.physics.film import contact_sheet
+            from moonteam.physics.trials.film import contact_sheet
 
             contact_sheet(stills, args.out / "sheet.png")
     if args.markdown:
@@ -116,8 +116,8 @@ def _run_kind(args: Args, name: str, stills: list) -> tuple[list[Traverse], int]
     """
     import numpy as np
 
-    from moonteam.physics.film import choose
-    from moonteam.physics.traverse import draw_routes, run_traverses
+    from moonteam.physics.trials.film import choose
+    from moonteam.physics.trials.traverse import draw_routes, run_traverses
     from moonteam.robots import KINDS
     from moonteam.terrain.site import make_site
 
@@ -146,8 +146,8 @@ def _run_kind(args: Args, name: str, stills: list) -> tuple[list[Traverse], int]
 
 def _film(args: Args, name: str, shot: Shot, recording: Recording, stills: list) -> None:
     """One film; a line on standard error where nothing can be rendered."""
-    from moonteam.physics.film import film
     from moonteam.physics.render import RenderingUnavailable
+    from moonteam.physics.trials.film import film
 
     assert args.out is not None
     try:
@@ -198,7 +198,7 @@ def _table(summaries: list[dict]) -> str:
 
 def _markdown(args: Args, summaries: list[dict]) -> str:
     """The summaries as a table of docs/results.md."""
-    from moonteam.evaluation import provenance
+    from moonteam.report import provenance
 
     command = (f"moonteam evaluate traverse --kind {' '.join(args.kind)} --site {args.site} "
                f"--count {args.count} --sites {args.sites} --seed {args.seed} "

@@ -48,7 +48,7 @@ def model_of(policy: Policy) -> bytes:
     try:
         import onnxruntime  # noqa: F401
 
-        from moonteam.policies import onnx_graph
+        from moonteam.policies.export import onnx_graph
     except ImportError as error:
         raise InputError("moonteam export", f"{error.name} is missing; install the extra: "
                          "pip install 'moonteam[export]'") from None

@@ -10,10 +10,11 @@ from typing import Literal
 
 import tyro
 
-from moonteam import files, mission, paths, scenario
+from moonteam import files, paths
 from moonteam.errors import InputError
 from moonteam.planners.base import Objective, Plan, Snapshot
-from moonteam.scenario import Scenario
+from moonteam.problem import mission, scenario
+from moonteam.problem.scenario import Scenario
 
 PlannerName = Literal["exact", "greedy", "lns", "cpsat", "exhaustive", "policy"]
 
@@ -127,7 +128,7 @@ def make_plan(args: Args, snapshot: Snapshot) -> Plan:
 
         return GreedyPlanner(*common).plan(snapshot)
     if args.planner == "lns":
-        from moonteam.planners.large import LnsPlanner
+        from moonteam.planners.lns import LnsPlanner
 
         return LnsPlanner(*common, time_limit=args.time_limit, seed=args.seed).plan(snapshot)
     if args.planner == "cpsat":
@@ -143,9 +144,9 @@ def make_plan(args: Args, snapshot: Snapshot) -> Plan:
 
 def _policy_plan(args: Args, snapshot: Snapshot) -> Plan:
     from moonteam import compilation
-    from moonteam.evaluation import decode as decoding
+    from moonteam.planners import decode as decoding
     from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
-    from moonteam.planners.rollout import plan_from_planner
+    from moonteam.planners.plans.stepwise import plan_from_planner
 
     how = decoding.parse(args.decode)
     compilation.enable_cache()
@@ -234,7 +235,7 @@ def run(args: Args) -> int:
     else:
         print_plan(case, plan, args.alpha, args.beta)
     if args.out is not None:
-        from moonteam.planners.figure import draw_plan
+        from moonteam.planners.plans.figure import draw_plan
 
         files.write_json(args.out / "plan.json", plan.document(), indent=0)
         draw_plan(args.out / "plan.png", case.scenario, plan, case.title, case.agents,

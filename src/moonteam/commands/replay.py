@@ -10,9 +10,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from moonteam import compilation, files, scenario
+from moonteam import compilation, files
 from moonteam.errors import InputError
-from moonteam.scenario import ACTIONS, Scenario
+from moonteam.problem import scenario
+from moonteam.problem.scenario import ACTIONS, Scenario
 
 
 @dataclass(frozen=True)

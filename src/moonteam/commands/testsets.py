@@ -15,7 +15,7 @@ import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.scenario import Optimal, Scenario, save_set
+from moonteam.problem.scenario import Optimal, Scenario, save_set
 
 if TYPE_CHECKING:
     import numpy as np
@@ -114,10 +114,10 @@ def certify(scenario: Scenario) -> Optimal | None:
 def best_known(scenario: Scenario, iterations: int, starts: int) -> Optimal | None:
     """Best values of large-neighbourhood searches, and lower bounds; None if unsolved."""
     from moonteam.planners.base import Snapshot
-    from moonteam.planners.bounds import lower_bounds
-    from moonteam.planners.large import LnsPlanner
-    from moonteam.planners.task import Task
-    from moonteam.planners.travel import travel_times
+    from moonteam.planners.lns import LnsPlanner
+    from moonteam.planners.search.bounds import lower_bounds
+    from moonteam.planners.search.task import Task
+    from moonteam.planners.search.travel import travel_times
 
     snapshot = Snapshot.start(scenario)
     low_makespan, low_moves = lower_bounds(Task.of(snapshot, travel_times(snapshot)), parts=4)

@@ -11,20 +11,20 @@ from typing import Protocol
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.evaluation import decode as decoding
 from moonteam.evaluation import rollouts
-from moonteam.evaluation.decode import Decode
 from moonteam.evaluation.metrics import Outcomes
-from moonteam.evaluation.progress import track
 from moonteam.evaluation.world import Walk, World, joint_actions, replay, snapshots
+from moonteam.planners import decode as decoding
 from moonteam.planners import exact, exhaustive, simulate
 from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
 from moonteam.planners.cpsat import CpSatPlanner
+from moonteam.planners.decode import Decode
 from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.exhaustive import ExhaustivePlanner
 from moonteam.planners.greedy import GreedyPlanner
-from moonteam.planners.large import LnsPlanner
 from moonteam.planners.learned import EntityBrain, Policy
+from moonteam.planners.lns import LnsPlanner
+from moonteam.report.progress import track
 
 OBJECTIVES: dict[str, Objective] = {"makespan": "makespan", "moves": "moves",
                                     "weighted": "weighted"}

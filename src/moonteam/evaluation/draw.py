@@ -8,7 +8,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.grid.scenarios import generate
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
 
 
 @dataclass(frozen=True)

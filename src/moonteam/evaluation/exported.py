@@ -13,7 +13,6 @@ from jax import Array
 
 from moonteam.evaluation import rollouts
 from moonteam.evaluation import world as worlds
-from moonteam.evaluation.progress import track
 from moonteam.evaluation.rollouts import Player, Pool
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
@@ -21,7 +20,8 @@ from moonteam.grid.scenarios import generate
 from moonteam.planners.learned import EntityBrain, Policy, RecurrentBrain
 from moonteam.policies import entity
 from moonteam.policies.entity import EntitySpec
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
+from moonteam.report.progress import track
 
 SIZES: tuple[dict[str, Any], ...] = (
     {"num_agents": 2, "num_targets": 4, "size": (16, 16)},

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from moonteam.evaluation import metrics, optima, provenance, report
+from moonteam.evaluation import metrics, optima
 from moonteam.evaluation import world as worlds
-from moonteam.evaluation.bootstrap import RESAMPLES, Bootstrap
 from moonteam.evaluation.contenders import Contender
 from moonteam.evaluation.world import World
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
+from moonteam.report import provenance, tables
+from moonteam.report.intervals import RESAMPLES, Bootstrap
 
 PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
           ("moves_gap", "moves over the optimum, %", 100.0),
           ("success", "success", 1.0))
-COLUMNS = (*report.GRID_COLUMNS, *report.SECONDS)
+COLUMNS = (*tables.GRID_COLUMNS, *tables.SECONDS)
 PAGE = tuple(c for c in COLUMNS if c.key not in ("M_st", "M_tte", "decisions"))
 """Columns of the Markdown table, which must not be too wide; the others follow from them."""
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.evaluation.bootstrap import Bootstrap, Figure
+from moonteam.report.intervals import Bootstrap, Figure
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from moonteam.evaluation.metrics import Reference
-from moonteam.evaluation.progress import track
 from moonteam.planners.base import Objective, Snapshot
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
+from moonteam.report.progress import track
 
 CERTIFIED = "certified optima of the file"
 SOLVED = "optima solved here by the exact planner"

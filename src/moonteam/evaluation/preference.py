@@ -11,16 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from moonteam.evaluation import metrics, provenance, rollouts
+from moonteam.evaluation import metrics, rollouts
 from moonteam.evaluation import world as worlds
-from moonteam.evaluation.bootstrap import Bootstrap
 from moonteam.evaluation.contenders import Planned
-from moonteam.evaluation.decode import Decode
 from moonteam.evaluation.metrics import Outcomes, Reference
 from moonteam.evaluation.world import World
+from moonteam.planners.decode import Decode
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
 from moonteam.planners.learned import Policy
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
+from moonteam.report import provenance
+from moonteam.report.intervals import Bootstrap
 
 POLICY, EXACT = "policy", "exact"
 KEYS = ("success", "makespan", "moves")

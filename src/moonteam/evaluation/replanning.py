@@ -22,10 +22,10 @@ from moonteam.evaluation import grid
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Contender, Options, contenders
 from moonteam.evaluation.metrics import Outcomes, Reference
-from moonteam.evaluation.progress import track
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
+from moonteam.report.progress import track
 
 ORACLE = (("exact", "makespan"), ("exact", "moves"))
 COLUMNS = tuple(column for column in grid.COLUMNS if column.key not in ("st_ratio", "tte_ratio"))

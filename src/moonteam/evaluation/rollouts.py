@@ -23,13 +23,13 @@ import numpy.typing as npt
 from jax import Array
 
 from moonteam.evaluation import world as worlds
-from moonteam.evaluation.decode import Decode
-from moonteam.evaluation.progress import say, track
 from moonteam.evaluation.world import Walk, World
 from moonteam.grid.config import EnvConfig
 from moonteam.planners.base import Objective
+from moonteam.planners.decode import Decode
 from moonteam.planners.learned import Brain, Policy, masked
-from moonteam.planners.travel import distance_fields
+from moonteam.planners.search.travel import distance_fields
+from moonteam.report.progress import say, track
 
 MOST_EPISODES = 256
 _PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of a network holds

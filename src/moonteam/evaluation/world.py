@@ -23,7 +23,7 @@ from moonteam.grid import env, scenarios
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.types import Problem, State
 from moonteam.planners.base import Snapshot
-from moonteam.scenario import Scenario
+from moonteam.problem.scenario import Scenario
 
 
 @jax.tree_util.register_dataclass

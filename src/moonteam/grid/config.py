@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from moonteam.errors import InputError
-from moonteam.scenario import ACTIONS, MAX_SKILLS
+from moonteam.problem.scenario import ACTIONS, MAX_SKILLS
 
 Phase = Literal["bootstrap", "refinement"]
 PHASES: tuple[Phase, ...] = ("bootstrap", "refinement")

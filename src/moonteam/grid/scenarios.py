@@ -18,7 +18,7 @@ from jax import Array
 from moonteam.errors import InputError
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.types import Buffer, Problem
-from moonteam.scenario import Agent, Scenario, Target
+from moonteam.problem.scenario import Agent, Scenario, Target
 
 LETTERS = "ABCDEFGH"
 OPEN = "*"  # the kind of agents that name none; in `blocked`, every kind
@@ -38,7 +38,7 @@ def to_problem(scenario: Scenario, num_buffer: int = 0) -> tuple[Problem, Array]
     """The arrays of a scenario, and its agents' cells [N, 2].
 
     Args:
-      scenario: checked, see `moonteam.scenario.load`.
+      scenario: checked, see `moonteam.problem.scenario.load`.
       num_buffer: the last so many targets are the buffer of a replanning episode.
 
     Raises:

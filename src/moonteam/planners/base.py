@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.scenario import ACTIONS, Scenario
+from moonteam.problem.scenario import ACTIONS, Scenario
 
 IntArray = npt.NDArray[np.int32]
 BoolArray = npt.NDArray[np.bool_]

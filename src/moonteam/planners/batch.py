@@ -19,11 +19,11 @@ from numba import njit
 
 from moonteam.compilation import cores
 from moonteam.errors import InputError
-from moonteam.planners import insertion, search
 from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.exact import MAX_TARGETS
-from moonteam.planners.task import weights
-from moonteam.planners.travel import UNREACHABLE, distance_field
+from moonteam.planners.search import insertion, schedules
+from moonteam.planners.search.task import weights
+from moonteam.planners.search.travel import UNREACHABLE, distance_field
 
 OPTIMAL, FEASIBLE, INFEASIBLE, UNFINISHED = 0, 1, 2, 3
 """Status of one state: proved; best found; not solvable as a whole (in time), the labels then
@@ -210,22 +210,22 @@ def _solve_one(cells, kinds, skills, target_cells, target_skills, target_and, so
     if kept > exact_to:
         makespan, moves = _search_near(start, between, which, skills, need, both, alpha, beta,
                                        horizon, iterations, seed, found)
-        outcome, status, bound = search.FEASIBLE, FEASIBLE, 0.0
+        outcome, status, bound = schedules.FEASIBLE, FEASIBLE, 0.0
     else:
-        outcome, makespan, moves, bound = search.solve(
+        outcome, makespan, moves, bound = schedules.solve(
             start, between, which, skills, need, both, alpha, beta, horizon, 0.0, np.inf, limit,
             found)
-        status = OPTIMAL if outcome == search.OPTIMAL else FEASIBLE
-    if outcome == search.NONE:
+        status = OPTIMAL if outcome == schedules.OPTIMAL else FEASIBLE
+    if outcome == schedules.NONE:
         status = UNFINISHED
         if np.isinf(bound):
             status = INFEASIBLE
-            outcome, makespan, moves, bound = search.solve(
+            outcome, makespan, moves, bound = schedules.solve(
                 start, between, which, skills, need, both, alpha, beta, 64 * (horizon + 64),
                 0.0, np.inf, limit, found)
     if kept < count:
         status = max(status, INFEASIBLE)
-    if outcome == search.NONE:
+    if outcome == schedules.NONE:
         return status, -1, -1
     solved_at = np.empty(kept, np.int32)
     timetable(start, between, which, found, solved_at)

@@ -19,11 +19,11 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
-from moonteam.planners.follow import Answer, RoutePlanner
-from moonteam.planners.insertion import coalitions
-from moonteam.planners.large import Weights, best_insertion, improve
-from moonteam.planners.task import Task, weights
-from moonteam.planners.travel import UNREACHABLE
+from moonteam.planners.lns import Weights, best_insertion, improve
+from moonteam.planners.plans.follow import Answer, RoutePlanner
+from moonteam.planners.search.insertion import coalitions
+from moonteam.planners.search.task import Task, weights
+from moonteam.planners.search.travel import UNREACHABLE
 
 Arc = tuple[int, int, int]
 """(agent, from, to); place -1 is the agent's start."""

@@ -20,11 +20,11 @@ import time
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.planners import search
 from moonteam.planners.base import IntArray, Objective
-from moonteam.planners.follow import Answer, RoutePlanner
-from moonteam.planners.large import Weights, best_insertion, measure
-from moonteam.planners.task import Task, weights
+from moonteam.planners.lns import Weights, best_insertion, measure
+from moonteam.planners.plans.follow import Answer, RoutePlanner
+from moonteam.planners.search import schedules
+from moonteam.planners.search.task import Task, weights
 
 MAX_TARGETS = 12
 """Open targets that the exact planner takes on: its tables grow as 2^M."""
@@ -67,12 +67,12 @@ class ExactPlanner(RoutePlanner):
         while True:
             clock = time.perf_counter()
             routes = np.full(task.start.shape, -1, np.int32)
-            outcome, makespan, moves, lower = search.solve(
+            outcome, makespan, moves, lower = schedules.solve(
                 task.start, task.between, task.kinds, task.skills, task.need, task.both,
                 alpha, beta, task.horizon, lower, upper, limit, routes)
-            if outcome != search.NONE:
+            if outcome != schedules.NONE:
                 best, upper = routes, alpha * makespan + beta * moves
-            if outcome == search.OPTIMAL or lower >= upper - 1e-9:
+            if outcome == schedules.OPTIMAL or lower >= upper - 1e-9:
                 return Answer(best, self._bound(upper), True)
             spent = time.perf_counter() - clock
             left = (self.time_limit or 0.0) - (time.perf_counter() - began)

@@ -15,9 +15,9 @@ import math
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.planners.follow import Answer, RoutePlanner
-from moonteam.planners.task import Task, weights
-from moonteam.planners.travel import UNREACHABLE
+from moonteam.planners.plans.follow import Answer, RoutePlanner
+from moonteam.planners.search.task import Task, weights
+from moonteam.planners.search.travel import UNREACHABLE
 
 MAX_TARGETS = 6
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from moonteam.planners.large import InsertionPlanner
+from moonteam.planners.lns import InsertionPlanner
 
 
 class GreedyPlanner(InsertionPlanner):

@@ -25,9 +25,9 @@ from moonteam.grid.observe import observe
 from moonteam.grid.types import Problem, State
 from moonteam.planners import simulate
 from moonteam.planners.base import SAMPLING, IntArray, Objective, Plan, Snapshot
-from moonteam.planners.routes import Certificate, infeasible, plan_of_trace
-from moonteam.planners.travel import UNREACHABLE, distance_fields
-from moonteam.policies import checkpoint, entity, recurrent
+from moonteam.planners.plans.routes import Certificate, infeasible, plan_of_trace
+from moonteam.planners.search.travel import UNREACHABLE, distance_fields
+from moonteam.policies import entity, policy_file, recurrent
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.recurrent import RecurrentSpec
 
@@ -149,13 +149,13 @@ class Policy:
 
     brain: Brain
     params: Any
-    source: checkpoint.PolicyFile
+    source: policy_file.PolicyFile
     path: str
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
         """Reads a policy file. Raises InputError if it is none, or its parts do not fit."""
-        stored = checkpoint.load_policy(path)
+        stored = policy_file.load_policy(path)
         kinds: dict[str, Any] = {"recurrent": (RecurrentSpec, RecurrentBrain, recurrent.init),
                                  "entity": (EntitySpec, EntityBrain, entity.init)}
         if stored.kind not in kinds:
@@ -169,7 +169,7 @@ class Policy:
                              f"{error}") from None
         spec.check(path)
         wanted = jax.eval_shape(partial(init, spec), jax.random.key(0))
-        checkpoint.check_shapes(path, stored.params, wanted)
+        policy_file.check_shapes(path, stored.params, wanted)
         params = jax.tree.map(jnp.asarray, stored.params)
         return cls(brain_type(spec), params, stored, str(path))
 

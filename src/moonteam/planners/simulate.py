@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.planners.base import BoolArray, IntArray, Snapshot, solved_now
-from moonteam.scenario import ACTIONS
+from moonteam.problem.scenario import ACTIONS
 
 DISPLACEMENTS = np.array([(0, 1), (0, -1), (-1, 0), (1, 0), (0, 0)], np.int32)
 """Cells (x, y) that each action adds: up, down, left, right, stay."""

@@ -27,7 +27,7 @@ from moonteam.errors import InputError
 from moonteam.grid.env import available
 from moonteam.grid.travel import UNREACHABLE, distances, first_step
 from moonteam.grid.types import Problem, State
-from moonteam.scenario import MAX_SKILLS
+from moonteam.problem.scenario import MAX_SKILLS
 
 NUM_ACTIONS = 5
 STAY = 4

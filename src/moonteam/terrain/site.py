@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 
 from moonteam.errors import InputError
-from moonteam.mission import Mission
+from moonteam.problem.mission import Mission
 from moonteam.terrain import generate
 from moonteam.terrain.surface import Surface
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.mission import Mission
+from moonteam.problem.mission import Mission
 from moonteam.robots import KINDS
 from moonteam.terrain.site import Site
 from moonteam.terrain.surface import Surface

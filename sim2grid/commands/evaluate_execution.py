@@ -1,0 +1,198 @@
+"""`moonteam evaluate execution`: hundreds of missions in physics, and what came of them."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from moonteam import files
+from sim2grid.study import journal
+from sim2grid.study.journal import Journal
+
+if TYPE_CHECKING:
+    from sim2grid.study.evaluation import Evaluation, Row
+
+PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Execute random missions in physics and compare what they cost with the grid's promise.
+
+    Each mission has a drone, a legged and a wheeled robot with random skills, random targets
+    and, if asked for, random events; all missions of a site stand on the same ground. A row of
+    the table is a loop with a planner and a mode: closed (the planner decides again at each
+    step, from where the robots really are), open (the grid plan walked through blindly, all
+    robots in lockstep), oracle (closed with the exact planner) and grid (no physics).
+    Exit code 0 whatever the missions came to, 130 if interrupted, with what is done saved.
+
+    Files in --out: report.html (one page), report.json, rows.csv, table.md, and rows.jsonl, to
+    which each mission is added as it ends, so that --resume can go on. The same options give the
+    same report.
+
+    Examples:
+      moonteam evaluate execution --site mare highland --count 100 --out runs/execution
+      moonteam evaluate execution --planner exact --loop closed open grid --mode barrier async
+      moonteam evaluate execution --site flat --count 8 --lose 1 --out runs/lose --resume
+      moonteam evaluate execution --backend native mjx --count 10 --out runs/backends
+      moonteam evaluate execution --count 20 --new-targets 5 --slow 0.5 --silent 0.5 --json
+    """
+
+    site: tuple[Literal["mare", "highland", "crater_rim", "polar", "flat"], ...] = ("mare",)
+    """Presets of the ground, one group of missions each."""
+    site_seed: int = 0
+    """Seed of the ground."""
+    count: int = 20
+    """Missions a site."""
+    loop: tuple[Literal["closed", "open", "oracle", "grid"], ...] = ("closed",)
+    """Which baselines stand in the table."""
+    mode: tuple[Literal["barrier", "async"], ...] = ("barrier",)
+    """barrier: all robots decide together; async: each when it arrives (closed, oracle)."""
+    planner: tuple[Literal["policy", "exact", "greedy"], ...] = ("policy",)
+    """Who decides: a learned policy, the exact planner, or greedy insertion."""
+    policy: str = "any_team"
+    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
+    decode: str = "argmax"
+    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
+    objective: Literal["makespan", "moves", "weighted"] = "makespan"
+    """What the planner minimises (exact, greedy, and policy with best-of-K)."""
+    targets: int = 5
+    """Targets of each mission, before events."""
+    side: int = 32
+    """Cells of a side of the map."""
+    cell: float = 1.0
+    """Metres a side of a cell."""
+    max_steps: int = 128
+    """Joint decisions after which a mission has failed."""
+    lose: float = 0.0
+    """Chance for each mission that one robot is lost, at a random decision in mid-mission."""
+    slow: float = 0.0
+    """Chance for each mission that one robot is slowed to 0.3 to 0.7 of its speed."""
+    silent: float = 0.0
+    """Chance for each mission that one robot is silent for 5 to 14 decisions."""
+    new_targets: int = 0
+    """New targets that appear in mid-mission, each at a random decision."""
+    impassable: int = 0
+    """Cells on the way of a robot on the ground that turn out closed to its kind."""
+    seed: int = 0
+    """Seed of the missions, their events and the planners."""
+    backend: tuple[Literal["native", "mjx"], ...] = ("native",)
+    """Physics engines: C MuJoCo, MJX for accelerators, or both beside each other."""
+    width: int = 25
+    """Worlds that the engine advances together."""
+    threads: int = 0
+    """CPU threads of the native engine, 0 for all; the report is the same."""
+    resume: bool = False
+    """Go on with the run in --out; the options must be the same."""
+    json: bool = False
+    """Print the report as one JSON document and nothing else."""
+    markdown: bool = False
+    """Print the tables as Markdown and nothing else."""
+    out: Path | None = None
+    """Output folder."""
+
+
+def run(args: Args) -> int:
+    """Evaluates, prints, saves."""
+    _check(args)
+    from moonteam.compilation import call_at_once, enable_cache
+
+    enable_cache()
+    call_at_once()
+    from moonteam.report import provenance
+    from sim2grid.study.evaluation import Row
+    from sim2grid.study.summary import document
+
+    evaluation = _evaluation(args)
+    if args.out:
+        held = Journal[Row](args.out, args.resume, _options(args), Row)
+        evaluation.rows |= {(row.contender, row.number): row for row in held.entries}
+        evaluation.keep = held.add
+    begun, interrupted = time.perf_counter(), False
+    try:
+        evaluation.run()
+    except KeyboardInterrupt:
+        interrupted = True
+    rows = evaluation.sorted_rows()
+    command = provenance.command("evaluate execution", args, _NOT_REPEATED)
+    report = document(rows, evaluation.entries, evaluation.contenders, _options(args),
+                      provenance.meta(command, args.seed), args.seed)
+    if interrupted:
+        report["interrupted"] = True
+    if args.out:
+        _save(args.out, report, rows)
+    _print(args, report)
+    _say(f"{len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
+    return journal.interrupted(args.out) if interrupted else 0
+
+
+_NOT_REPEATED = ("json", "markdown", "out", "resume", "threads")
+"""Options on which the report does not depend."""
+
+
+def _check(args: Args) -> None:
+    """Raises InputError for options out of range."""
+    journal.check(args, (
+        ("count", 1, 100_000), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
+        ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096), ("threads", 0, 1024),
+        ("new_targets", 0, 64), ("impassable", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1),
+        ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
+
+
+def _evaluation(args: Args) -> Evaluation:
+    from sim2grid.study.evaluation import Contender, Evaluation, contenders
+    from sim2grid.study.fleet import Rates, Recipe
+
+    rates = Rates(args.lose, args.slow, args.silent, args.new_targets, args.impassable)
+    recipes = [Recipe(site, args.site_seed, args.seed, args.targets, args.side, args.cell,
+                      args.max_steps, rates) for site in args.site]
+    who = [Contender("closed", "barrier", name, args.policy if name == "policy" else None,
+                     args.decode if name == "policy" else "argmax", args.objective)
+           for name in args.planner]
+    return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who, args.backend),
+                      args.seed, args.width, args.threads, progress=journal.progress)
+
+
+def _options(args: Args) -> dict[str, Any]:
+    """What the rows depend on; the same in a run and in what resumes it."""
+    left_out = (*_NOT_REPEATED, "lose", "slow", "silent", "new_targets", "impassable")
+    options = {key: value for key, value in asdict(args).items() if key not in left_out}
+    rates = {"lose": args.lose, "slow": args.slow, "silent": args.silent,
+             "new_targets": args.new_targets, "impassable": args.impassable}
+    return options | {"rates": rates}
+
+
+def _save(out: Path, report: dict[str, Any], rows: list[Row]) -> None:
+    from moonteam.report.tables import plain_csv, plain_markdown
+    from sim2grid.study.evaluation_page import evaluation_page
+    from sim2grid.study.summary import csv_rows, tables
+
+    files.write_json(out / "report.json", report)
+    files.write_text(out / "report.html", evaluation_page(report, str(out / "report.json")))
+    files.write_text(out / "table.md", plain_markdown(report, tables(report)) + "\n")
+    if rows:
+        files.write_text(out / "rows.csv", plain_csv(csv_rows(rows)))
+
+
+def _print(args: Args, report: dict[str, Any]) -> None:
+    from moonteam.report.tables import plain_markdown, show_plain
+    from sim2grid.study.summary import tables
+
+    if args.json:
+        print(files.dump_json(report))
+    elif args.markdown:
+        print(plain_markdown(report, tables(report)))
+    else:
+        (titles, rows), *more = tables(report)
+        heads = ["\n".join([row[0], " ".join(word for word in row[1:4] if word != "-")])
+                 for row in rows]
+        turned = [[title, *(row[k] for row in rows)] for k, title in enumerate(titles) if k > 3]
+        show_plain(report, [(["", *heads], turned), *more])
+
+
+def _say(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"moonteam: {text}", file=sys.stderr)

@@ -1,0 +1,412 @@
+"""`moonteam rollout`: a mission in physics, from the file to video and report."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import msgspec
+import numpy.typing as npt
+import tyro
+
+from moonteam import __version__, files, paths
+from moonteam.errors import InputError
+from moonteam.problem import mission as missions
+from moonteam.problem.mission import Mission
+
+if TYPE_CHECKING:
+    from moonteam.planners.base import Planner
+    from sim2grid.loop.execution import Execution
+    from sim2grid.loop.prepare import Prepared
+    from sim2grid.measure.metrics import GridPlan, Report
+    from sim2grid.show.film import Film
+
+
+@dataclass(frozen=True)
+class Args:
+    """Run a mission in physics: a video, a map of the paths and a report.
+
+    The planner decides on the grid; every move becomes a waypoint that a simulated robot has to
+    reach over lunar ground; where the robots really are is what the planner sees next.
+    Exit code 0 if every target was solved, 1 if the mission failed.
+
+    Files in the output folder: report.html (all of it on one page), video.mp4 (map.mp4 where no
+    3-D pictures can be made), paths.png, report.json (the same for the same seed), timing.json
+    (wall-clock times), config.json.
+
+    Examples:
+      moonteam rollout demo
+      moonteam rollout outpost --planner exact --backend native --out runs/outpost
+      moonteam rollout my_mission.yaml --planner exact --no-video --json
+      moonteam rollout demo --planner exact --backend native --viewer
+      moonteam rollout --from runs/execution/report.json --mission 17
+    """
+
+    mission: tyro.conf.Positional[str] = ""
+    """Mission file (.yaml) or the name of a bundled mission; not with --from."""
+    planner: Literal["policy", "exact", "greedy"] = "policy"
+    """Who decides: a learned policy, the exact planner, or greedy insertion."""
+    policy: str = "any_team"
+    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
+    decode: str = "argmax"
+    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
+    objective: Literal["makespan", "moves", "weighted"] = "makespan"
+    """What the planner minimises (exact, greedy, and policy with best-of-K)."""
+    mode: Literal["barrier", "async"] = "barrier"
+    """barrier: all robots decide together; async: each decides when it arrives."""
+    backend: Literal["mjx", "native"] = "mjx"
+    """Physics engine: MJX (JAX) or C MuJoCo, which is faster on a CPU."""
+    seed: int = 0
+    """Seed of what is random in the planner; the ground has its own seed in the mission."""
+    report: Annotated[Path | None, tyro.conf.arg(name="from", metavar="REPORT")] = None
+    """Instead of a mission file: report.json of `moonteam evaluate execution`. The mission is run
+    again as it was then, planner and seed included, and ends as it did on the same machine."""
+    number: Annotated[int | None, tyro.conf.arg(name="mission", metavar="N")] = None
+    """Number of the mission in --from."""
+    contender: str | None = None
+    """Whose run of it, a name in --from such as "closed exact barrier"; the first by default."""
+    out: Path | None = None
+    """Output folder; runs/NAME by default."""
+    video: bool = True
+    """Make the video."""
+    viewer: bool = False
+    """Show the mission in a live 3-D window while it runs; needs a display."""
+    json: bool = False
+    """Print the report as one JSON document and nothing else."""
+
+
+FROM_REPORT = ("planner", "policy", "decode", "objective", "mode", "backend", "seed")
+"""Options that a report answers for its missions."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One mission ready to be run: what to execute, where, and how to call it in the report."""
+
+    prepared: Prepared
+    execution: Execution
+    start: npt.NDArray  # [nq]
+    plan: GridPlan
+    who: str  # the planner's name in the report
+    objective: str | None
+    backend: str
+    seed: int
+    title: str  # of the film
+    command: str  # that makes it again
+    width: int = 1  # rows of the engine
+    row: int = 0  # the one that is used
+    before: Report | None = None  # what came of it when it was run first
+
+
+def run(args: Args) -> int:
+    """Runs the mission and writes its folder; the exit code says whether it succeeded."""
+    _check(args)
+    from moonteam.compilation import call_at_once, enable_cache
+
+    enable_cache()
+    call_at_once()
+    if args.viewer:
+        from sim2grid.show.viewer import check_display
+
+        check_display()
+    made = _from_file(args) if args.report is None else _from_report(args)
+    mission = made.prepared.mission
+    out = args.out or Path("runs") / mission.name
+    _make_folder(out, args, mission)
+    interrupted = False
+    try:
+        timing = _drive(args, made)
+    except KeyboardInterrupt:
+        interrupted, timing = True, {}
+    report = _report(made)
+    files.write_json(out / "report.json", report)
+    files.write_json(out / "timing.json", timing)
+    film = _film(made)
+    _save_paths(film, out)
+    if interrupted:
+        print(f"moonteam: stopped after {report.seconds:g} s of the mission; {out}/report.json "
+              "holds what was done", file=sys.stderr)
+        return 130
+    video = _save_video(film, made.prepared, out) if args.video else None
+    _save_page(made, film, report, timing, out, video)
+    if args.json:
+        print(files.dump_json(report))
+    else:
+        _show(report, timing, out, video)
+    if made.before is not None and report != made.before:
+        _say(f"not as in {args.report}: {_difference(made.before, report)}; another machine or "
+             "other versions?")
+    return 0 if report.success else 1
+
+
+def _check(args: Args) -> None:
+    """What can be said of the options alone. Raises InputError."""
+    from moonteam.planners.decode import parse
+
+    if args.seed < 0:
+        raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
+    if args.out is not None and args.out.exists() and not args.out.is_dir():
+        raise InputError("--out", f"{args.out} is a file; a folder is needed")
+    parse(args.decode)
+    if args.report is None:
+        for name, value in (("--mission", args.number), ("--contender", args.contender)):
+            if value is not None:
+                raise InputError(name, "says which mission of a report; give --from REPORT too")
+        if not args.mission:
+            raise InputError("rollout", "give a mission file, the name of a bundled "
+                             "mission, or --from REPORT --mission N")
+        return
+    if args.mission:
+        raise InputError("--from", f"give a report or the mission {args.mission}, not both")
+    if args.number is None:
+        raise InputError("--from", "give the number of the mission too: --mission N")
+    for field in fields(args):
+        if field.name in FROM_REPORT and getattr(args, field.name) != field.default:
+            raise InputError(f"--{field.name}", "not with --from: the report says it")
+
+
+def _from_file(args: Args) -> Run:
+    """The run of a mission file. Raises InputError for whatever it cannot be."""
+    from sim2grid.loop.execution import Execution
+    from sim2grid.loop.prepare import prepare
+
+    mission = _load(args.mission)
+    planner = _planner(args)
+    prepared = prepare(mission, args.mission)
+    plan = _grid_plan(prepared, planner, args.seed)
+    execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
+                          prepared.frame, seed=args.seed, mode=args.mode)
+    who = args.planner if args.planner != "policy" else f"policy {Path(args.policy).stem}"
+    return Run(prepared, execution, prepared.scene.qpos0, plan, args.planner,
+               None if args.planner == "policy" else args.objective, args.backend, args.seed,
+               f"{mission.name}: {who}", _command(args))
+
+
+def _from_report(args: Args) -> Run:
+    """The run of a mission of an evaluation. Raises InputError for one that is not there."""
+    from sim2grid.study.restage import load_report, restage
+
+    assert args.report is not None
+    assert args.number is not None
+    staged = restage(load_report(args.report), args.number, args.report, args.contender)
+    row, contender = staged.row, staged.contender
+    words = ["moonteam", "rollout", "--from", str(args.report), "--mission", str(row.number),
+             "--contender", contender.name]
+    return Run(staged.prepared, staged.execution, staged.prepared.scene.qpos0, staged.grid_plan,
+               row.report.planner, row.report.objective, contender.backend, row.seed,
+               f"mission {row.number}, {row.site}: {contender.name}", shlex.join(words),
+               staged.width, row.slot, row.report)
+
+
+def _command(args: Args) -> str:
+    """The command line of these options, but where it writes to."""
+    from moonteam.report.provenance import command
+
+    return command("rollout", args, ("out", "json", "viewer", "video"), ("mission",))
+
+
+def _load(name: str) -> Mission:
+    """The mission, named after its file where it has no name. Raises InputError."""
+    suffix = ".yml" if name.endswith(".yml") else ".yaml"
+    path = paths.find(name, "missions", suffix)
+    mission = missions.load(path)
+    return msgspec.structs.replace(mission, name=mission.name or path.stem)
+
+
+def _planner(args: Args) -> Planner:
+    from sim2grid.loop.brains import make_planner
+
+    policy = None
+    if args.planner == "policy":
+        policy = paths.find(args.policy, "policies", ".safetensors")
+    return make_planner(args.planner, policy=policy, objective=args.objective,
+                        decode=args.decode)
+
+
+def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:
+    """The planner on the grid alone. Raises InputError if it cannot serve this mission."""
+    from sim2grid.loop.replan import grid_trace
+    from sim2grid.measure.metrics import GridPlan
+
+    trace = grid_trace(prepared.scenario, planner, seed)
+    return GridPlan(trace.complete, trace.makespan, trace.moves)
+
+
+def _make_folder(out: Path, args: Args, mission: Mission) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--out", f"{out} cannot be made: {error.strerror}") from None
+    for name in ("video.mp4", "map.mp4", "paths.png", "report.json", "timing.json",
+                 "report.html"):
+        (out / name).unlink(missing_ok=True)  # of an earlier run
+    options = {key: value for key, value in asdict(args).items() if key not in ("out", "json")}
+    files.write_json(out / "config.json", {
+        "moonteam": __version__, "options": options, "mission": msgspec.to_builtins(mission)})
+
+
+def _drive(args: Args, made: Run) -> dict[str, float]:
+    """Runs the physics; returns wall-clock times. Raises KeyboardInterrupt when stopped."""
+    from moonteam.physics.backends import make_backend
+    from sim2grid.loop.drive import run as run_executions
+
+    execution, prepared = made.execution, made.prepared
+    _say(f"compiling the {made.backend} physics "
+         "(kept for later runs; the first time takes longest)")
+    backend = make_backend(made.backend, prepared.scene)
+    begun = time.perf_counter()
+    looks: list[float] = []
+    with contextlib.ExitStack() as open_until:
+        update = open_until.enter_context(_bar("mission", len(execution.record.targets)))
+        show = None
+        if args.viewer:
+            from sim2grid.show.viewer import LiveView
+
+            show = open_until.enter_context(LiveView(prepared, backend.log_every)).show
+
+        def look() -> None:
+            looks.append(time.perf_counter())
+            solved = int(execution.snapshot.solved.sum())
+            update(solved, f"{execution.time:.1f} s, decision {execution.decision}, "
+                           f"{solved} of {len(execution.record.targets)} targets")
+            if show:
+                show(execution)
+
+        run_executions([execution], backend, made.start, look, width=made.width, rows=[made.row])
+    if not looks:
+        return {"compile_s": 0.0, "wall_s": time.perf_counter() - begun}
+    running = looks[-1] - looks[0]
+    simulated = execution.record.seconds() - execution.rules.chunk_s
+    return {"compile_s": round(looks[0] - begun, 3), "wall_s": round(looks[-1] - begun, 3),
+            "real_time_factor": round(simulated / max(running, 1e-9), 3)}
+
+
+def _report(made: Run) -> Report:
+    from sim2grid.measure.metrics import make_report
+    from sim2grid.measure.slip import ground_height
+
+    prepared = made.prepared
+    return make_report(
+        made.execution.record, prepared.mission, prepared.frame, prepared.bases,
+        planner=made.who, objective=made.objective, mode=made.execution.mode,
+        backend=made.backend, seed=made.seed, grid_plan=made.plan,
+        height=ground_height(prepared.site.heights, prepared.site.spacing))
+
+
+def _film(made: Run) -> Film:
+    from sim2grid.show.film import Film
+    from sim2grid.show.picture import Ground
+
+    prepared = made.prepared
+    return Film(prepared.mission, made.execution.record, prepared.frame,
+                Ground(prepared.site.heights, prepared.site.spacing), prepared.bases,
+                made.title, prepared.barred())
+
+
+def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], out: Path,
+               video: Path | None) -> None:
+    """report.html: everything on one page."""
+    import yaml
+
+    from sim2grid.show import page, plots
+
+    mission = msgspec.to_builtins(made.prepared.mission)
+    page.write(out / "report.html", page.rollout_page(
+        report, command=made.command, made=video, out=out, timing=timing,
+        replans=[(round(r.time_s, 1), r.decision, r.words) for r in film.story.replans],
+        plots=[("Who did what when", plots.timeline(film.story)),
+               ("Motion", plots.motion(film.story, film.bases))],
+        mission=yaml.safe_dump(mission, sort_keys=False, default_flow_style=None)))
+
+
+def _save_paths(film: Film, out: Path) -> None:
+    with files.replacing(out / "paths.png") as temporary:
+        film.last_map(960).save(temporary)
+
+
+def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:
+    """video.mp4, or map.mp4 where there is nothing to render with, with a word about why."""
+    from moonteam.physics.render import RenderingUnavailable
+    from sim2grid.show.film import write
+    from sim2grid.show.views import SceneViews
+
+    path, views = out / "video.mp4", None
+    try:
+        views = SceneViews(prepared, film)
+        film = film.with_views(views)
+    except RenderingUnavailable as error:
+        print(f"moonteam: {error}", file=sys.stderr)
+        print("moonteam: no 3-D video; making map.mp4 instead", file=sys.stderr)
+        path = out / "map.mp4"
+    count = 0
+    with _bar("video", film.num_frames) as update:
+
+        def drawn() -> None:
+            nonlocal count
+            count += 1
+            update(count, path.name)
+
+        write(film, path, drawn)
+    if views is not None:
+        views.shut()
+    return path
+
+
+@contextlib.contextmanager
+def _bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
+    """A progress bar on standard error if that is a terminal: `update(done, words)`."""
+    if not sys.stderr.isatty():
+        yield lambda done, words: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    with Progress(TextColumn(title), BarColumn(), TextColumn("{task.fields[words]}"),
+                  TimeElapsedColumn(), console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(title, total=total, words="")
+        yield lambda done, words: progress.update(task, completed=done, words=words)
+
+
+def _say(text: str) -> None:
+    print(f"moonteam: {text}", file=sys.stderr, flush=True)
+
+
+def _difference(before: Report, now: Report) -> str:
+    """The first figure in which two reports differ."""
+    for name in before.__struct_fields__:
+        if getattr(before, name) != getattr(now, name):
+            if isinstance(getattr(now, name), tuple):
+                return f"{name} differ"
+            return f"{name} was {getattr(before, name)}, is {getattr(now, name)}"
+    return "nothing"
+
+
+def _show(report: Report, timing: dict[str, float], out: Path, video: Path | None) -> None:
+    """The report for a person."""
+    print(f"{report.mission}: {'success' if report.success else 'FAILED'}"
+          + (f" ({report.cause}: {report.detail})" if not report.success else ""))
+    grid = report.grid_plan.makespan if report.grid_plan else None
+    print(f"  {report.seconds:.1f} s of mission, {report.decisions} decisions"
+          + (f" (grid plan: {grid})" if grid is not None else "")
+          + f", {report.moves} moves, {report.planner}, {report.mode}, {report.backend}")
+    for target in report.targets:
+        by = ", ".join(f"{name} at {distance:.2f} m" for name, distance
+                       in zip(target.robots, target.distance_m, strict=True))
+        print(f"  target {target.name:<10} " + (
+            f"solved at decision {target.decision}, {target.time_s:.1f} s, by {by}"
+            if target.solved else "not solved"))
+    for robot in report.robots:
+        per_move = "-" if robot.seconds_per_move is None else f"{robot.seconds_per_move:.1f} s"
+        print(f"  robot {robot.name:<11} {robot.kind:<8} {robot.moves} moves, {per_move} each, "
+              f"{robot.distance_m:.1f} m, tilt to {robot.max_tilt_deg:.0f} deg"
+              + (f", LOST: {robot.lost} at {robot.lost_s:.1f} s" if robot.lost else ""))
+    if "real_time_factor" in timing:
+        print(f"  {timing['compile_s']:.1f} s to compile, then "
+              f"{timing['real_time_factor']:.1f} times real time")
+    print(f"  {out / 'report.html'}" + (f", {video}" if video else ""))

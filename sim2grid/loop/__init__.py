@@ -1,0 +1,1 @@
+"""The loop: planner, waypoints, physics, positions back to the grid."""

@@ -1,0 +1,71 @@
+"""From a mission to what an execution needs: ground, map of where each kind can go, scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from moonteam.errors import InputError
+from moonteam.physics.scene import Placement, Scene, build_scene
+from moonteam.planners.base import Snapshot
+from moonteam.problem.mission import Mission
+from moonteam.problem.scenario import Scenario
+from moonteam.robots import KINDS
+from moonteam.terrain.site import Site, for_mission
+from moonteam.terrain.traversability import FLYERS, passable_cells
+from sim2grid.frame import Frame
+from sim2grid.loop.execution import Body
+from sim2grid.loop.replan import grid_problem, unsolvable
+from sim2grid.waypoints import waypoints
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A mission on its ground. `passable`: kind -> [H, W] bool, indexed [y, x]."""
+
+    mission: Mission
+    frame: Frame
+    site: Site
+    passable: dict[str, npt.NDArray[np.bool_]]
+    scenario: Scenario
+    scene: Scene
+    bodies: tuple[Body, ...]
+
+    @property
+    def bases(self) -> tuple[int, ...]:
+        """Index of each robot's free joint in qpos."""
+        return tuple(body.base for body in self.bodies)
+
+    def barred(self) -> npt.NDArray[np.bool_] | None:
+        """[H, W] cells that some robot of the mission cannot enter; None where there are none."""
+        closed = ~np.logical_and.reduce([self.passable[r.kind] for r in self.mission.robots])
+        return closed if closed.any() else None
+
+
+def prepare(mission: Mission, source: object) -> Prepared:
+    """Makes ground and scene. Raises InputError for a mission that its ground forbids.
+
+    `source` is the mission file, for messages.
+    """
+    frame = Frame(mission.map.size, mission.map.cell_m)
+    site = for_mission(mission)
+    passable = passable_cells(site, mission, {r.kind for r in mission.robots})
+    for i, robot in enumerate(mission.robots):
+        x, y = robot.start
+        if not passable[robot.kind][y, x]:
+            raise InputError(source, f"cell {[x, y]} is ground that a {robot.kind} robot cannot "
+                             f"cross (slope or boulder) on site {site.name} with seed "
+                             f"{site.seed}; choose another cell or seed", f"robots[{i}].start")
+    scenario = grid_problem(mission, passable)
+    for j in unsolvable(Snapshot.start(scenario)):
+        raise InputError(source, f"no robots with the skills of {mission.target_name(j)} can "
+                         f"reach its cell {list(mission.targets[j].at)} over this ground; choose "
+                         "another cell or seed", f"targets[{j}].at")
+    starts = waypoints(frame, [r.start for r in mission.robots], [True] * len(mission.robots))
+    scene = build_scene(site, [
+        Placement(robot.name, KINDS[robot.kind], (float(x), float(y)))
+        for robot, (x, y) in zip(mission.robots, starts, strict=True)])
+    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.name in FLYERS) for r in scene.robots)
+    return Prepared(mission, frame, site, passable, scenario, scene, bodies)

@@ -1,0 +1,206 @@
+"""From a record to the report: who solved what, how well each robot drove, what it cost.
+
+All figures come from logged poses and never from what a controller believes. Nothing here
+depends on wall-clock time: the same record gives the same report.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from moonteam.problem.mission import Mission
+from moonteam.problem.scenario import Cell
+from sim2grid.frame import Frame, tilt
+from sim2grid.loop.record import Leg, Record
+from sim2grid.measure.slip import Height, slip
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One robot's motion. `power` and `propellant_rate` hold over the step that ended then."""
+
+    times: Floats  # [T] s
+    xyz: Floats  # [T, 3] m
+    tilt: Floats  # [T] rad, between the body's up and the world's
+    power: Floats  # [T] W
+    propellant_rate: Floats  # [T] kg/s
+    qpos: Floats | None = None  # [T, 7 + joints] the robot's own, for its slip
+
+
+def tracks(record: Record, bases: Sequence[int]) -> list[Track]:
+    """Each robot's track; `bases` holds the index of each robot's free joint in qpos."""
+    times = np.concatenate(record.times)
+    qpos = np.concatenate(record.qpos).astype(np.float64)
+    power = np.concatenate(record.power).astype(np.float64)
+    rate = np.concatenate(record.propellant).astype(np.float64)
+    ends = [min((c for c in bases if c > b), default=qpos.shape[1]) for b in bases]
+    return [Track(times, qpos[:, b:b + 3], tilt(qpos[:, b + 3:b + 7]), power[:, i], rate[:, i],
+                  qpos[:, b:end])
+            for i, (b, end) in enumerate(zip(bases, ends, strict=True))]
+
+
+def cross_track(track: Track, legs: Sequence[Leg]) -> Floats:
+    """Distances [S] m from the straight line of each leg (true start to waypoint).
+
+    One value for each logged moment of each leg that went to another cell.
+    """
+    parts = []
+    for leg in legs:
+        along = leg.waypoint - leg.start_xy
+        length = float(np.hypot(*along))
+        if not leg.moving or length < 1e-9 or leg.end_s is None:
+            continue
+        during = (track.times > leg.start_s + 1e-9) & (track.times <= leg.end_s + 1e-9)
+        offset = track.xyz[during, :2] - leg.start_xy
+        parts.append(np.abs(along[0] * offset[:, 1] - along[1] * offset[:, 0]) / length)
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+class TargetReport(msgspec.Struct, frozen=True):
+    """One target. `distance_m[k]` is how far `robots[k]` stood from the centre when solved."""
+
+    name: str
+    at: Cell
+    skills: tuple[str, ...]
+    type: str
+    solved: bool
+    decision: int | None
+    time_s: float | None
+    robots: tuple[str, ...]
+    distance_m: tuple[float, ...]
+
+
+class RobotReport(msgspec.Struct, frozen=True):
+    """One robot. Rates and means are null where there was nothing to measure."""
+
+    name: str
+    kind: str
+    skills: tuple[str, ...]
+    final_cell: Cell
+    lost: str | None  # the cause
+    lost_s: float | None
+    moves: int  # joint actions other than stay, as the grid counts them
+    arrivals: int
+    seconds_per_move: float | None
+    cross_track_rms_m: float | None
+    cross_track_p95_m: float | None
+    timeouts: int
+    wrong_cells: int
+    wrong_cell_rate: float | None
+    max_tilt_deg: float
+    slip: float | None  # see sim2grid.slip; null for flyers
+    falls: int
+    stuck: int
+    distance_m: float
+    energy_j: float
+    propellant_kg: float
+
+
+class GridPlan(msgspec.Struct, frozen=True):
+    """The same planner on the grid alone: what the mission would cost without physics."""
+
+    success: bool
+    makespan: int | None
+    moves: int
+
+
+class Report(msgspec.Struct, frozen=True):
+    """`report.json`: everything but wall-clock time, so equal seeds give equal reports."""
+
+    mission: str
+    success: bool
+    cause: str | None  # of failure
+    detail: str
+    planner: str
+    objective: str | None
+    mode: str
+    backend: str
+    seed: int
+    seconds: float
+    decisions: int
+    moves: int
+    grid_plan: GridPlan | None
+    inflation: float | None  # decisions over the grid plan's makespan
+    replans: dict[str, int]
+    targets: tuple[TargetReport, ...]
+    robots: tuple[RobotReport, ...]
+
+
+def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]:
+    """What became of each target, those brought by events at the end."""
+    solves = {s.target: s for s in record.solves}
+    rows = []
+    for j, target in enumerate(record.targets):
+        solve = solves.get(j)
+        rows.append(TargetReport(
+            name=record.target_names[j], at=target.at, skills=target.skills, type=target.type,
+            solved=solve is not None,
+            decision=solve.decision if solve else None,
+            time_s=_round(solve.time_s) if solve else None,
+            robots=tuple(mission.robots[i].name for i in solve.robots) if solve else (),
+            distance_m=tuple(_round(d) for d in solve.distance_m) if solve else ()))
+    return tuple(rows)
+
+
+def robot_report(mission: Mission, robot: int, track: Track, record: Record,
+                 frame: Frame, height: Height | None = None) -> RobotReport:
+    """One robot's figures. Seconds per move are over moves that ended in arrival."""
+    own = [leg for leg in record.legs if leg.robot == robot]
+    sent = [leg for leg in own if leg.moving and leg.ended in ("arrived", "timeout")]
+    arrived = [leg for leg in sent if leg.ended == "arrived"]
+    spent = [leg.end_s - leg.start_s for leg in arrived if leg.end_s is not None]
+    wrong = sum(leg.end_cell != leg.goal_cell for leg in sent)
+    error = cross_track(track, own)
+    loss = next((x for x in record.losses if x.robot == robot), None)
+    steps = np.diff(track.times)
+    x, y = (int(v) for v in frame.cell(np.nan_to_num(track.xyz[-1, :2])))
+    spec = mission.robots[robot]
+    slipped = None if track.qpos is None else slip(spec.kind, track.qpos, height)
+    return RobotReport(
+        name=spec.name, kind=spec.kind, skills=spec.skills, final_cell=(x, y),
+        lost=loss.cause if loss else None, lost_s=_round(loss.time_s) if loss else None,
+        moves=sum(leg.action != 4 for leg in own), arrivals=len(arrived),
+        seconds_per_move=_round(float(np.mean(spent))) if spent else None,
+        cross_track_rms_m=_round(float(np.sqrt(np.mean(error ** 2)))) if len(error) else None,
+        cross_track_p95_m=_round(float(np.percentile(error, 95))) if len(error) else None,
+        timeouts=sum(leg.ended == "timeout" for leg in sent), wrong_cells=wrong,
+        wrong_cell_rate=_round(wrong / len(sent)) if sent else None,
+        max_tilt_deg=_round(float(np.degrees(np.nanmax(track.tilt)))),
+        slip=_round(slipped) if slipped is not None else None,
+        falls=int(loss is not None and loss.cause == "fallen"),
+        stuck=int(loss is not None and loss.cause == "stuck"),
+        distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
+        energy_j=_round(float((track.power[1:] * steps).sum())),
+        propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6))
+
+
+def make_report(record: Record, mission: Mission, frame: Frame, bases: Sequence[int], *,
+                planner: str, objective: str | None, mode: str, backend: str, seed: int,
+                grid_plan: GridPlan | None, height: Height | None = None) -> Report:
+    """The whole report; `bases` as in `tracks`, `height` as in `slip.slip`."""
+    decisions = len(record.decisions)
+    robots = tuple(robot_report(mission, i, track, record, frame, height)
+                   for i, track in enumerate(tracks(record, bases)))
+    inflation = None
+    if record.success and grid_plan is not None and grid_plan.makespan:
+        inflation = _round(decisions / grid_plan.makespan)
+    return Report(
+        mission=mission.name, success=record.success, cause=record.failure,
+        detail=record.detail, planner=planner, objective=objective, mode=mode,
+        backend=backend, seed=seed, seconds=_round(record.seconds()), decisions=decisions,
+        moves=sum(r.moves for r in robots), grid_plan=grid_plan, inflation=inflation,
+        replans=dict(sorted(Counter(cause for _, cause in record.replans).items())),
+        targets=target_reports(record, mission), robots=robots)
+
+
+def _round(value: float, digits: int = 4) -> float:
+    """Rounded for reading: a tenth of a millimetre, a tenth of a millisecond."""
+    return round(float(value), digits)

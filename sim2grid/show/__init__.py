@@ -1,0 +1,1 @@
+"""What people look at: film, map, page, plots, live view."""

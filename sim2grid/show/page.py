@@ -1,0 +1,213 @@
+"""One-page HTML reports that open anywhere: no network, no other files but a very large video.
+
+Plain functions from data to text; every word from outside goes through `html.escape`.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from moonteam import files
+from sim2grid.measure.metrics import Report
+from sim2grid.show.picture import robot_color
+from sim2grid.show.plots import hexed
+
+LARGEST_VIDEO = 20_000_000
+"""Bytes up to which a video is put into the page; a larger one is linked."""
+
+STYLE = """
+:root{color-scheme:dark}
+body{background:#0e111a;color:#ebeef5;font:15px/1.45 system-ui,'DejaVu Sans',sans-serif;
+ margin:0 auto;max-width:1000px;padding:24px}
+h1{font-size:26px;margin:0 0 4px}h2{font-size:18px;margin:32px 0 10px;color:#9fb4d8}
+.sub{color:#aab2c3;margin:0 0 18px}.good{color:#46d76e}.bad{color:#ff6a4c}.dim{color:#8a93a6}
+.tiles{display:flex;flex-wrap:wrap;gap:10px}.tile{background:#181d2b;border-radius:8px;
+ padding:10px 14px;min-width:96px}.tile b{display:block;font-size:20px}.tile span{color:#8a93a6;
+ font-size:12px}
+table{border-collapse:collapse;width:100%;font-size:13px;font-variant-numeric:tabular-nums}
+.wide{overflow-x:auto}th{color:#8a93a6;font-weight:600;text-align:left;vertical-align:bottom}
+th,td{padding:5px 9px;border-bottom:1px solid #262d3f}td.n,th.n{text-align:right}
+video,img{max-width:100%;border-radius:8px}.plot img{display:block;width:100%}
+.two{display:grid;grid-template-columns:1fr 1fr;gap:12px}
+pre,code{background:#181d2b;border-radius:6px;font-size:12px}pre{padding:10px;overflow-x:auto}
+code{padding:1px 5px}summary{cursor:pointer;color:#9fb4d8}
+"""
+
+
+@dataclass(frozen=True)
+class Raw:
+    """Text that is HTML already."""
+
+    text: str
+
+
+def page(title: str, parts: Iterable[str]) -> str:
+    """A whole document."""
+    return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style></head>\n<body>\n"
+            + "\n".join(part for part in parts if part) + "\n</body></html>\n")
+
+
+def cell(value: object, digits: int = 2) -> str:
+    """A value for a person: a dash for none, few digits for numbers, escaped words."""
+    if isinstance(value, Raw):
+        return value.text
+    if value is None or (isinstance(value, float) and value != value):
+        return '<span class="dim">-</span>'
+    if isinstance(value, bool):
+        return f'<span class="{"good" if value else "bad"}">{"yes" if value else "no"}</span>'
+    if isinstance(value, float):
+        return f"{value:,.{digits}f}"
+    return html.escape(str(value))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table; columns whose values are all numbers stand to the right."""
+    body = [list(row) for row in rows]
+    numbers = [bool(body) and all(isinstance(row[k], (int, float, type(None))) and not
+                                  isinstance(row[k], bool) for row in body)
+               for k in range(len(head))]
+    kind = [' class="n"' if number else "" for number in numbers]
+    top = "".join(f"<th{k}>{html.escape(word)}</th>" for k, word in zip(kind, head, strict=True))
+    lines = "\n".join("<tr>" + "".join(f"<td{k}>{cell(v)}</td>" for k, v in zip(
+        kind, row, strict=True)) + "</tr>" for row in body)
+    return f'<div class="wide"><table><thead><tr>{top}</tr></thead>\n<tbody>{lines}</tbody>' \
+           "</table></div>"
+
+
+def tiles(pairs: Iterable[tuple[str, object]]) -> str:
+    """Figures in a row: (name, value)."""
+    return '<div class="tiles">' + "".join(
+        f'<div class="tile"><b>{cell(value)}</b><span>{html.escape(name)}</span></div>'
+        for name, value in pairs) + "</div>"
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    """A file's content as an address."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def plot(svg: str, alt: str) -> str:
+    """An SVG picture, as an image of its own so that its names meet no others."""
+    if not svg:
+        return ""
+    address = data_uri(svg.encode(), "image/svg+xml")
+    return f'<div class="plot"><img alt="{html.escape(alt)}" src="{address}"></div>'
+
+
+def picture(path: str | os.PathLike[str], alt: str) -> str:
+    """A PNG file put into the page; nothing if it does not exist."""
+    path = Path(path)
+    if not path.is_file():
+        return ""
+    return f'<img alt="{html.escape(alt)}" src="{data_uri(path.read_bytes(), "image/png")}">'
+
+
+def video(path: Path | None, beside: Path) -> str:
+    """An MP4 file put into the page, or linked from the folder `beside` if it is too large."""
+    if path is None or not path.is_file():
+        return '<p class="dim">No video was made.</p>'
+    if path.stat().st_size > LARGEST_VIDEO:
+        address = html.escape(os.path.relpath(path, beside))
+        return f'<p><a href="{address}">{address}</a> is too large to stand in this page.</p>'
+    address = data_uri(path.read_bytes(), "video/mp4")
+    return f'<video controls muted loop playsinline src="{address}"></video>'
+
+
+def folded(title: str, text: str) -> str:
+    """Text that shows when it is asked for."""
+    return f"<details><summary>{html.escape(title)}</summary><pre>{html.escape(text)}</pre>" \
+           "</details>"
+
+
+def name_of_robot(index: int, name: str) -> Raw:
+    """A robot's name in its colour."""
+    return Raw(f'<b style="color:{hexed(robot_color(index))}">{html.escape(name)}</b>')
+
+
+def requirement(skills: Sequence[str], kind: str) -> str:
+    """A+B for AND, A/B for OR."""
+    return ("+" if kind == "AND" else "/").join(skills)
+
+
+def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
+                 replans: Sequence[tuple[float, int, str]] = (),
+                 plots: Sequence[tuple[str, str]] = (), timing: dict[str, float] | None = None,
+                 mission: str = "") -> str:
+    """A rollout's page.
+
+    Args:
+      report: of the execution.
+      command: that makes it again.
+      made: the video, None if there is none.
+      out: the folder that the page will lie in, with its paths.png.
+      replans: (time s, decision, words) of each cause of a new plan.
+      plots: (title, SVG).
+      timing: wall-clock times.
+      mission: the mission file's text.
+    """
+    verdict = '<span class="good">success</span>' if report.success else (
+        f'<span class="bad">failed: {html.escape((report.cause or "").replace("_", " "))}</span>')
+    who = report.planner + (f" ({report.objective})" if report.objective else "")
+    grid = report.grid_plan
+    solved = sum(target.solved for target in report.targets)
+    return page(f"{report.mission}: moonteam rollout", [
+        f"<h1>{html.escape(report.mission)}: {verdict}</h1>",
+        f'<p class="sub">{html.escape(who)}, {html.escape(report.mode)}, '
+        f"{html.escape(report.backend)}, seed {report.seed}"
+        + (f". {html.escape(report.detail)}" if report.detail else "") + "</p>",
+        tiles([
+            ("targets solved", f"{solved} of {len(report.targets)}"),
+            ("mission seconds", round(report.seconds, 1)), ("decisions", report.decisions),
+            ("of the grid plan", grid.makespan if grid else None),
+            ("inflation", report.inflation), ("moves", report.moves),
+            ("causes of new plans", len(replans)),
+            ("times real time", (timing or {}).get("real_time_factor"))]),
+        "<h2>Video</h2>", video(made, out),
+        "<h2>Targets</h2>", _targets(report), "<h2>Robots</h2>", _robots(report),
+        *([] if not replans else ["<h2>New plans</h2>", table(
+            ["time s", "decision", "cause"], replans)]),
+        *[part for title, svg in plots for part in (
+            f"<h2>{html.escape(title)}</h2>", plot(svg, title))],
+        "<h2>Paths</h2>", picture(out / "paths.png", "paths on the map"),
+        "<h2>Make it again</h2>", f"<pre>{html.escape(command)}</pre>",
+        folded("mission file", mission) if mission else ""])
+
+
+def _targets(report: Report) -> str:
+    return table(
+        ["target", "cell", "needs", "solved", "decision", "time s", "by", "distance m"],
+        [(t.name, f"{t.at[0]}, {t.at[1]}", requirement(t.skills, t.type), t.solved, t.decision,
+          t.time_s, ", ".join(t.robots) or None,
+          ", ".join(f"{d:.2f}" for d in t.distance_m) or None) for t in report.targets])
+
+
+def _robots(report: Report) -> str:
+    return table(
+        ["robot", "kind", "skills", "moves", "s a move", "way m", "off track rms m", "95 % m",
+         "tilt deg", "slip", "late", "wrong cell", "energy kJ", "propellant g", "lost"],
+        [(name_of_robot(i, r.name), r.kind, "".join(r.skills), r.moves, r.seconds_per_move,
+          r.distance_m, r.cross_track_rms_m, r.cross_track_p95_m, r.max_tilt_deg, r.slip,
+          r.timeouts, r.wrong_cells, r.energy_j / 1000, r.propellant_kg * 1000,
+          None if r.lost is None else f"{r.lost.replace('_', ' ')} at {r.lost_s:.1f} s")
+         for i, r in enumerate(report.robots)])
+
+
+def write(path: str | os.PathLike[str], text: str) -> None:
+    """Writes a page, whole or not at all."""
+    files.write_text(path, text)
+
+
+def mean_interval(row: dict[str, Any], key: str) -> tuple[Any, Any, Any] | None:
+    """(value, low, high) of a summary row that keeps its intervals under `intervals`."""
+    if row.get(key) is None:
+        return None
+    low, high = (row.get("intervals") or {}).get(key) or (None, None)
+    return row[key], low, high

@@ -1,0 +1,225 @@
+"""The map seen from above: ground, grid, targets by state, robots and their paths.
+
+Drawn with Pillow alone, so it needs neither a GPU nor a display. Pixels: x right, y down;
+the map's north is up.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
+
+from moonteam.problem.mission import Target
+from sim2grid.frame import Frame
+
+Color = tuple[int, int, int]
+
+INK: Color = (235, 238, 245)
+NIGHT: Color = (14, 17, 26)
+OPEN: Color = (255, 86, 60)
+SOLVED: Color = (70, 215, 110)
+BARRED: Color = (150, 60, 60)
+REPLAN: Color = (255, 250, 235)
+GREY: Color = (130, 130, 130)
+STATES: dict[str, Color] = {
+    "moving": INK, "waiting": (170, 178, 195), "late": (255, 180, 60), "lost": OPEN}
+ROBOTS: tuple[Color, ...] = (
+    (64, 196, 255), (255, 214, 64), (236, 120, 255), (120, 255, 214),
+    (255, 160, 90), (150, 160, 255), (190, 255, 100), (255, 130, 170))
+
+SMOOTH = 2
+"""Drawn this many times larger, then reduced: smooth edges."""
+
+
+@functools.cache
+def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which matplotlib brings along, `size` pixels high."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name, size)
+
+
+def robot_color(index: int) -> Color:
+    """A robot's colour, the same in every picture."""
+    return ROBOTS[index % len(ROBOTS)]
+
+
+def requirement(target: Target) -> str:
+    """A+B for AND, A/B for OR."""
+    return ("+" if target.type == "AND" else "/").join(target.skills)
+
+
+def hillshade(heights: npt.NDArray, spacing: float) -> npt.NDArray[np.uint8]:
+    """Brightness [ny, nx] of ground [ny, nx] m lit from the north-west, row 0 in the south."""
+    north, east = np.gradient(heights.astype(float), spacing)
+    light = np.array([-1.0, 1.0, 1.2]) / np.linalg.norm([-1.0, 1.0, 1.2])
+    up = 1.0 / np.sqrt(1.0 + east**2 + north**2)
+    shade = (-east * light[0] - north * light[1] + light[2]) * up
+    relief = (heights - heights.min()) / max(float(np.ptp(heights)), 1e-6)
+    contrast = (shade - light[2]) / max(float(shade.std()), 0.05)  # level ground: none
+    return np.clip(100 + 22 * contrast + 30 * (relief - 0.5), 15, 200).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Elevations [ny, nx] m about the origin, row 0 in the south, `spacing` m apart."""
+
+    heights: npt.NDArray
+    spacing: float
+
+
+@dataclass(frozen=True)
+class RobotMark:
+    """A robot on the map: its path so far [T, 2] m ends where it is."""
+
+    name: str
+    kind: str
+    path: npt.NDArray
+    lost: bool = False
+
+
+@dataclass(frozen=True)
+class TargetMark:
+    """A target on the map."""
+
+    name: str
+    target: Target
+    solved: bool
+
+
+class MapPicture:
+    """Draws a mission's map at about `side` pixels; the ground is drawn once and kept."""
+
+    def __init__(self, frame: Frame, ground: Ground, side: int,
+                 barred: npt.NDArray[np.bool_] | None = None):
+        self.frame = frame
+        self.pixel = max(1.0, side / max(frame.size)) * SMOOTH  # a cell's width
+        self.width = round(frame.size[0] * self.pixel)
+        self.height = round(frame.size[1] * self.pixel)
+        self._base = self._draw_base(ground, barred)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the finished picture, pixels."""
+        return self.width // SMOOTH, self.height // SMOOTH
+
+    def draw(self, robots: Sequence[RobotMark], targets: Sequence[TargetMark],
+             replans: Sequence[npt.NDArray] = (), labels: bool = True) -> Image.Image:
+        """The map with targets, paths, robots, and a mark at each place [2] m that brought a
+        new plan; `labels` writes names beside them.
+        """
+        image = self._base.copy()
+        pen = ImageDraw.Draw(image)
+        for mark in targets:
+            self._target(pen, mark, labels)
+        for i, robot in enumerate(robots):
+            if len(robot.path) > 1:
+                points = [tuple(p) for p in self._pixels(robot.path)]
+                pen.line(points, fill=robot_color(i), width=max(2, round(self.pixel * 0.07)),
+                         joint="curve")
+        for place in replans:
+            x, y = self._pixels(place)
+            draw_replan(pen, (float(x), float(y)), max(self.pixel * 0.2, 4.5 * SMOOTH))
+        for i, robot in enumerate(robots):
+            self._robot(pen, i, robot, labels)
+        return image.resize(self.size, Image.Resampling.BOX)
+
+    def _pixels(self, xy: npt.NDArray) -> npt.NDArray:
+        """Pixels [..., 2] of points [..., 2] m."""
+        at = self.frame.continuous(np.nan_to_num(xy)) * self.pixel
+        return np.stack([at[..., 0], self.height - at[..., 1]], axis=-1)
+
+    def _draw_base(self, ground: Ground, barred: npt.NDArray[np.bool_] | None) -> Image.Image:
+        shade = hillshade(ground.heights, ground.spacing)
+        ny, nx = shade.shape
+        half = np.array(self.frame.size) * self.frame.cell_m / 2
+        middle = np.array([nx - 1, ny - 1]) / 2
+        low, high = middle - half / ground.spacing, middle + half / ground.spacing
+        whole = Image.fromarray(shade[::-1])  # north up
+        box = (low[0] + 0.5, ny - 0.5 - high[1], high[0] + 0.5, ny - 0.5 - low[1])
+        image = whole.transform((self.width, self.height), Image.Transform.EXTENT, box,
+                                Image.Resampling.BILINEAR).convert("RGB")
+        pen = ImageDraw.Draw(image, "RGBA")
+        if barred is not None:
+            for y, x in np.argwhere(barred):
+                left, top = x * self.pixel, self.height - (y + 1) * self.pixel
+                pen.rectangle([left, top, left + self.pixel, top + self.pixel],
+                              fill=(*BARRED, 110))
+        for x in range(self.frame.size[0] + 1):
+            pen.line([(x * self.pixel, 0), (x * self.pixel, self.height)], (255, 255, 255, 45), 1)
+        for y in range(self.frame.size[1] + 1):
+            pen.line([(0, y * self.pixel), (self.width, y * self.pixel)], (255, 255, 255, 45), 1)
+        return image
+
+    def _target(self, pen: ImageDraw.ImageDraw, mark: TargetMark, labels: bool) -> None:
+        color = SOLVED if mark.solved else OPEN
+        x, y = self._pixels(self.frame.centre(np.array(mark.target.at, float)))
+        reach = max(self.pixel * 0.46, 5.0 * SMOOTH)
+        width = max(2, round(reach * 0.2))
+        pen.rectangle([x - reach, y - reach, x + reach, y + reach], outline=color, width=width)
+        size = round(max(self.pixel * 0.26, (12 if labels else 9) * SMOOTH))
+        need = requirement(mark.target)
+        # What solved a target stands in it: its needs are written beside its name then.
+        inside = not mark.solved and self.pixel * 0.9 > pen.textlength(need, font(size, True))
+        if inside:
+            _text(pen, (x, y), need, color, size, "mm")
+        if labels:
+            text = mark.name if inside else f"{mark.name} {need}"
+            below = y + reach + size * 1.2 < self.height
+            _text(pen, (self._fit(pen, x, text, size),
+                        y + reach + 2 if below else y - reach - 2),
+                  text, color, size, "ma" if below else "md")
+
+    def _fit(self, pen: ImageDraw.ImageDraw, x: float, text: str, size: int) -> float:
+        """The middle of a text near x that stays inside the picture."""
+        half = pen.textlength(text, font(size, True)) / 2 + 4
+        return float(np.clip(x, half, max(half, self.width - half)))
+
+    def _robot(self, pen: ImageDraw.ImageDraw, index: int, robot: RobotMark,
+               labels: bool) -> None:
+        color = GREY if robot.lost else robot_color(index)
+        x, y = self._pixels(robot.path[-1])
+        draw_robot(pen, robot.kind, (float(x), float(y)),
+                   max(self.pixel * 0.24, 4.5 * SMOOTH), color)
+        if labels:
+            size = round(max(self.pixel * 0.22, 12 * SMOOTH))
+            away = max(self.pixel * 0.3, 8 * SMOOTH)
+            above = y - away - size * 1.3 > 0
+            _text(pen, (self._fit(pen, x, robot.name, size), y - away if above else y + away),
+                  robot.name, color, size, "md" if above else "ma")
+
+
+def draw_robot(pen: ImageDraw.ImageDraw, kind: str, at: tuple[float, float], reach: float,
+               color: Color) -> None:
+    """Triangle for a drone, disc for a legged robot, square for a wheeled one."""
+    x, y = at
+    line = max(1, round(reach * 0.2))
+    if kind == "drone":
+        low = y + reach * 0.8
+        corners = [(x, y - reach * 1.15), (x - reach, low), (x + reach, low)]
+        pen.polygon(corners, fill=color, outline=NIGHT, width=line)
+    elif kind == "legged":
+        pen.ellipse([x - reach, y - reach, x + reach, y + reach], color, NIGHT, line)
+    else:
+        side = reach * 0.85
+        pen.rectangle([x - side, y - side, x + side, y + side], color, NIGHT, line)
+
+
+def draw_replan(pen: ImageDraw.ImageDraw, at: tuple[float, float], reach: float) -> None:
+    """A white diamond: what happened here brought a new plan."""
+    x, y = at
+    for size, color in ((reach, NIGHT), (reach * 0.75, REPLAN), (reach * 0.35, NIGHT)):
+        pen.polygon([(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill=color)
+
+
+def _text(pen: ImageDraw.ImageDraw, at: tuple[float, float], text: str, color: Color, size: int,
+          anchor: str) -> None:
+    """Bold text with a dark rim, legible on any ground."""
+    pen.text(at, text, color, font(size, True), anchor, stroke_width=max(1, size // 9),
+             stroke_fill=NIGHT)

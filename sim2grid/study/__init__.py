@@ -1,0 +1,1 @@
+"""Many missions: fleets, contenders, sensitivity, speed."""

@@ -1,0 +1,284 @@
+"""Many missions executed by several contenders, one row each; rows to means and failures.
+
+A contender is a loop with a planner and a mode:
+
+- `closed`: the planner is asked again at each decision, with the grid as physics left it.
+- `oracle`: the same with the exact planner.
+- `open`: the grid plan, made once before any event, walked through blindly: all robots together
+  take the plan's next cell when all have arrived or timed out, wherever they are.
+- `grid`: no physics, every robot is at once where it was sent (see `ideal`).
+
+Missions keep row and number of rows of the engine however they are run, so that each can be
+repeated alone to the bit. Legend: F missions of a fleet, B rows of the engine.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from moonteam import paths
+from moonteam.planners.base import Objective, Planner
+from moonteam.problem.mission import Mission
+from sim2grid.loop.brains import planner_maker
+from sim2grid.loop.drive import Backend, run
+from sim2grid.loop.execution import Execution, Mode, Route, Rules
+from sim2grid.loop.record import Record
+from sim2grid.measure.metrics import GridPlan, Report, make_report
+from sim2grid.measure.slip import ground_height
+from sim2grid.study.fleet import Fleet, Recipe, make_fleet
+from sim2grid.study.ideal import (
+    IdealBackend,
+    ideal_bodies,
+    ideal_start,
+    nominal_times,
+    on_the_clock,
+    route_of,
+)
+
+Loop = Literal["closed", "open", "oracle", "grid"]
+
+
+class Contender(msgspec.Struct, frozen=True):
+    """Who decides, how often, and who waits for whom."""
+
+    loop: Loop
+    mode: Mode
+    planner: str  # policy, exact or greedy
+    policy: str | None = None  # file or name of a bundled one
+    decode: str = "argmax"
+    objective: Objective = "makespan"
+    backend: str = "native"  # engine; without meaning for the loop `grid`
+
+    @property
+    def who(self) -> str:
+        """Planner, or policy with its decoding where that is not argmax."""
+        if self.planner != "policy":
+            return self.planner
+        name = Path(self.policy or "").stem
+        return name if self.decode == "argmax" else f"{name}({self.decode})"
+
+    @property
+    def name(self) -> str:
+        """Such as `closed exact barrier`; open loop and grid have no mode to choose.
+
+        The engine is named where it is not the native one.
+        """
+        words = [self.loop] + ([self.who] if self.loop != "oracle" else [])
+        words += [self.mode] if self.loop in ("closed", "oracle") else []
+        return " ".join(words + ([self.backend] if self.backend != "native" else []))
+
+
+class Row(msgspec.Struct, frozen=True):
+    """One mission by one contender. `number` counts missions over all sites of the report."""
+
+    number: int
+    contender: str
+    site: str
+    site_seed: int
+    seed: int  # of the planner
+    slot: int  # row of the engine
+    solvable: bool  # False where lost robots of the mission's own events left it unsolvable
+    nominal_s: float | None  # mission seconds of the same planner on the grid
+    report: Report
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """A mission of the report."""
+
+    number: int
+    draws: int  # until the ground allowed it
+    mission: Mission
+
+
+@dataclass(frozen=True)
+class OnGrid:
+    """What a planner makes of a mission on the grid alone."""
+
+    report: Report
+    plan: GridPlan
+    route: Route
+    nominal_s: float
+
+
+@dataclass
+class Evaluation:
+    """Missions of several sites and the contenders that try them.
+
+    `rows` holds what is done, by contender and number; `keep` is called with each new row.
+    """
+
+    recipes: Sequence[Recipe]
+    count: int  # missions a site
+    contenders: Sequence[Contender]
+    seed: int = 0
+    width: int = 25  # B
+    threads: int = 0  # of the native engine, 0 for all CPUs
+    keep: Callable[[Row], None] = lambda row: None
+    progress: Callable[[str, int, int], None] = lambda title, done, total: None
+    rows: dict[tuple[str, int], Row] = field(default_factory=dict)
+    entries: list[Entry] = field(default_factory=list)
+
+    def run(self) -> None:
+        """Runs what is not done yet. Raises InputError before a mission that cannot be run."""
+        fleets = [make_fleet(recipe, self.count) for recipe in self.recipes]
+        for index, fleet in enumerate(fleets):
+            self.entries += [Entry(index * self.count + k, fleet.draws[k], mission)
+                             for k, mission in enumerate(fleet.missions)]
+        for index, fleet in enumerate(fleets):
+            Group(self, fleet, index * self.count).run()
+
+    def sorted_rows(self) -> list[Row]:
+        """Rows by site, contender and number, however they came."""
+        order = {c.name: i for i, c in enumerate(self.contenders)}
+        return sorted(self.rows.values(), key=lambda row: (
+            row.number // self.count, order.get(row.contender, len(order)), row.number))
+
+
+class Group:
+    """The missions of one site."""
+
+    def __init__(self, evaluation: Evaluation, fleet: Fleet, first: int):
+        self._all, self._fleet, self._first = evaluation, fleet, first
+        self._height = ground_height(fleet.site.heights, fleet.site.spacing)
+        self._width = min(evaluation.width, len(fleet.missions))
+        self._engines: dict[str, Backend] = {}
+        self._plans: dict[tuple, list[OnGrid]] = {}
+
+    def run(self) -> None:
+        """All contenders."""
+        for contender in self._all.contenders:
+            todo = [k for k in range(len(self._fleet.missions))
+                    if (contender.name, self._first + k) not in self._all.rows]
+            if todo:
+                self._run(contender, todo)
+
+    def _run(self, contender: Contender, todo: list[int]) -> None:
+        make = maker(contender)
+        grid = self._on_grid(contender, make)
+        if contender.loop == "grid":
+            for k in todo:
+                self._keep(contender, k, grid[k].report, grid[k])
+            return
+        routes: list[Route | None] = [None] * len(grid)
+        if contender.loop == "open":
+            routes = [plan.route for plan in self._on_grid(contender, make, events=False)]
+        executions = [self._execution(contender, make, k, routes[k]) for k in todo]
+        done = len(self._fleet.missions) - len(todo)
+        title = f"{self._fleet.site.name}: {contender.name}"
+
+        def finished(index: int) -> None:
+            nonlocal done
+            k = todo[index]
+            report = self._report(contender, k, executions[index].record, grid[k].plan)
+            executions[index].record = Record()  # its poses are not needed any more
+            self._keep(contender, k, report, grid[k])
+            done += 1
+            self._all.progress(title, done, len(self._fleet.missions))
+
+        self._all.progress(title, done, len(self._fleet.missions))
+        run(executions, self._backend(contender.backend), self._fleet.starts[todo],
+            width=self._width, rows=[k % self._width for k in todo], finished=finished)
+
+    def _backend(self, name: str) -> Backend:
+        if name not in self._engines:
+            from moonteam.physics.backends import make_backend
+
+            self._engines[name] = make_backend(
+                name, self._fleet.scene, threads=self._all.threads)
+        return self._engines[name]
+
+    def _execution(self, contender: Contender, make: Callable[[], Planner], k: int,
+                   route: Route | None) -> Execution:
+        fleet = self._fleet
+        return Execution(fleet.missions[k], fleet.scenarios[k], make(), fleet.bodies, fleet.frame,
+                         seed=self._seed(k), mode=contender.mode, route=route)
+
+    def _seed(self, k: int) -> int:
+        return self._all.seed + self._first + k
+
+    def _report(self, contender: Contender, k: int, record: Record, plan: GridPlan) -> Report:
+        objective = None if contender.planner == "policy" else contender.objective
+        return make_report(
+            record, self._fleet.missions[k], self._fleet.frame, self._fleet.bases,
+            planner=contender.who, objective=objective, mode=contender.mode,
+            backend=contender.backend, seed=self._seed(k), grid_plan=plan, height=self._height)
+
+    def _keep(self, contender: Contender, k: int, report: Report, grid: OnGrid) -> None:
+        recipe = self._fleet.missions[k].site
+        losses = {robot.lost for robot in report.robots if robot.lost}
+        by_event = report.cause == "unsolvable" and losses == {"event"}
+        row = Row(number=self._first + k, contender=contender.name, site=recipe.preset or "",
+                  site_seed=recipe.seed, seed=report.seed, slot=k % self._width,
+                  solvable=not by_event, nominal_s=grid.nominal_s, report=report)
+        self._all.rows[contender.name, row.number] = row
+        self._all.keep(row)
+
+    def _on_grid(self, contender: Contender, make: Callable[[], Planner],
+                 events: bool = True) -> list[OnGrid]:
+        """The missions on the grid alone, kept for the other contenders of that planner."""
+        events = events and any(mission.events for mission in self._fleet.missions)
+        key = (contender.who, contender.objective, events)
+        if key not in self._plans:
+            seeds = [self._seed(k) for k in range(len(self._fleet.missions))]
+            self._plans[key] = on_grid(self._fleet, make, events, seeds)
+        return self._plans[key]
+
+
+def on_grid(fleet: Fleet, make: Callable[[], Planner], events: bool, seeds: Sequence[int]
+            ) -> list[OnGrid]:
+    """What a planner makes of a fleet's missions without physics, with or without events."""
+    bodies, rules = ideal_bodies(fleet.bodies), Rules()
+    executions = []
+    for k, mission in enumerate(fleet.missions):
+        spec = mission if events else msgspec.structs.replace(mission, events=())
+        executions.append(Execution(spec, fleet.scenarios[k], make(), bodies, fleet.frame,
+                                    seed=seeds[k], rules=rules))
+    starts = np.stack([ideal_start(fleet.frame, [r.start for r in mission.robots])
+                       for mission in fleet.missions])
+    run(executions, IdealBackend(rules.chunk_steps), starts)
+    return [_ideal(fleet, k, execution, bodies) for k, execution in enumerate(executions)]
+
+
+def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) -> OnGrid:
+    record, mission = execution.record, fleet.missions[k]
+    times = nominal_times(record, bodies, fleet.frame.cell_m)
+    moves = sum(leg.action != 4 for leg in record.legs)
+    makespan = len(record.decisions) if record.success else None
+    plan = GridPlan(record.success, makespan, moves)
+    report = make_report(record, mission, fleet.frame, [body.base for body in bodies],
+                         planner=execution.planner.name, objective=None, mode="barrier",
+                         backend="grid", seed=execution.seed, grid_plan=plan)
+    starts = [robot.start for robot in mission.robots]
+    return OnGrid(on_the_clock(report, times), plan, route_of(record, starts),
+                  round(float(times[-1]), 4))
+
+
+def maker(contender: Contender) -> Callable[[], Planner]:
+    """Makes the planners of a contender. Raises InputError."""
+    policy = None
+    if contender.planner == "policy":
+        policy = paths.find(contender.policy or "", "policies", ".safetensors")
+    return planner_maker(contender.planner, policy=policy, objective=contender.objective,
+                         decode=contender.decode)
+
+
+def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],
+               backends: Sequence[str] = ("native",)) -> list[Contender]:
+    """All combinations that mean something, each once; `planners` give who decides."""
+    found: dict[str, Contender] = {}
+    exact = Contender("oracle", "barrier", "exact")
+    for loop in loops:
+        for mode, backend in itertools.product(
+                modes if loop in ("closed", "oracle") else ("barrier",),
+                backends if loop != "grid" else ("native",)):
+            for who in planners if loop != "oracle" else (exact,):
+                one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
+                found.setdefault(one.name, one)
+    return list(found.values())

@@ -1,0 +1,339 @@
+"""Rows of an evaluation to a document: means with intervals, failures by cause, tables.
+
+The document is `report.json` of `moonteam evaluate execution`:
+
+- `meta`: command, seed, commit, versions, machine.
+- `options`: everything that the missions and their executions depend on.
+- `contenders`: `name` with loop, mode, planner, policy, decode, objective.
+- `summary`: a row for each site and contender, figures with `intervals` of 95 %.
+- `comparisons`: async over barrier and one engine over the other, on missions that both solved.
+- `differences`: missions that went otherwise on another engine, and what differed.
+- `failures`: for each site and contender, cause -> mission numbers.
+- `missions`: number, draws and the whole mission as in its file.
+- `rows`: a row for each mission and contender; `report` is that of `moonteam rollout`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from moonteam.report.intervals import Bootstrap, Figure
+from sim2grid.measure.metrics import RobotReport
+from sim2grid.study.evaluation import Contender, Entry, Row
+
+
+def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence[Contender],
+             options: dict[str, Any], meta: dict[str, Any], seed: int) -> dict[str, Any]:
+    """The whole report, plain values only. `rows` as `Evaluation.sorted_rows` gives them."""
+    groups: dict[tuple[str, int, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.site, row.site_seed, row.contender), []).append(row)
+    by_name = {contender.name: contender for contender in contenders}
+    used = {key: group for key, group in groups.items() if key[2] in by_name}
+    heads = {key: {"site": key[0], "site_seed": key[1], "contender": key[2]} for key in used}
+    return {
+        "kind": "execution",
+        "title": "executions in physics",
+        "meta": meta,
+        "options": options,
+        "contenders": [{"name": c.name, **msgspec.to_builtins(c)} for c in contenders],
+        "summary": [heads[key] | _about(by_name[key[2]]) | summarise(group, seed)
+                    for key, group in used.items()],
+        "comparisons": compare(used, by_name, seed),
+        "differences": differences(used, by_name),
+        "failures": [heads[key] | {"causes": failures(group)} for key, group in used.items()],
+        "notes": notes(options),
+        "missions": [msgspec.to_builtins(entry) for entry in entries],
+        "rows": [msgspec.to_builtins(row) for row in rows if row.contender in by_name],
+    }
+
+
+def _about(contender: Contender) -> dict[str, str]:
+    return {"loop": contender.loop, "planner": contender.who, "mode": contender.mode,
+            "backend": contender.backend}
+
+
+def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
+    """Means of one group. Seconds, decisions and gaps are over the missions that succeeded."""
+    boot = Bootstrap(len(rows), seed)
+    won = np.array([row.report.success for row in rows])
+    able = np.array([row.solvable for row in rows])
+
+    def values(read: Callable[[Row], float | None], only: np.ndarray | None = None) -> np.ndarray:
+        found = np.array([math.nan if (v := read(row)) is None else v for row in rows], float)
+        return found if only is None else np.where(only, found, math.nan)
+
+    seconds = values(lambda row: row.report.seconds, won)
+    decisions = values(lambda row: row.report.decisions, won)
+    sent = values(lambda row: sum(map(legs_sent, row.report.robots)))
+    figures = {
+        "success": boot.mean(won.astype(float)),
+        "success_solvable": boot.ratio(won & able, able),
+        "seconds": boot.mean(seconds),
+        "decisions": boot.mean(decisions),
+        "moves": boot.mean(values(lambda row: row.report.moves, won)),
+        "inflation": boot.ratio(decisions, values(
+            lambda row: row.report.grid_plan.makespan if row.report.grid_plan else None, won)),
+        "slowdown": boot.ratio(seconds, values(lambda row: row.nominal_s, won)),
+        "wrong_cell_rate": boot.ratio(values(
+            lambda row: sum(robot.wrong_cells for robot in row.report.robots)), sent),
+        "timeout_rate": boot.ratio(values(
+            lambda row: sum(robot.timeouts for robot in row.report.robots)), sent),
+        "replans": boot.mean(values(lambda row: sum(row.report.replans.values()))),
+        "cross_track_rms_m": boot.mean(values(lambda row: _mean(
+            [robot.cross_track_rms_m for robot in row.report.robots]))),
+        "energy_kj": boot.mean(values(lambda row: sum(
+            robot.energy_j for robot in row.report.robots) / 1e3, won)),
+        "propellant_kg": boot.mean(values(lambda row: sum(
+            robot.propellant_kg for robot in row.report.robots), won)),
+    }
+    causes = Counter(cause for row in rows for cause, n in row.report.replans.items()
+                     for _ in range(n))
+    robots = [robot for row in rows for robot in row.report.robots]
+    return {
+        "missions": len(rows), "solved": int(won.sum()), "solvable": int(able.sum()),
+        **{key: _plain(figure.value) for key, figure in figures.items()},
+        "falls": sum(robot.falls for robot in robots),
+        "stuck": sum(robot.stuck for robot in robots),
+        "replans_by_cause": dict(sorted(causes.items())),
+        "intervals": {key: _ends(figure) for key, figure in figures.items()},
+    }
+
+
+def legs_sent(robot: RobotReport) -> int:
+    """Moves to another cell that ended in arrival or time-out."""
+    return robot.arrivals + robot.timeouts
+
+
+def failure_label(row: Row) -> str:
+    """Cause of a failed mission, with what was lost on the way: `unsolvable: legged stuck`."""
+    losses = sorted(f"{robot.kind} {robot.lost.replace('_', ' ')}" for robot in row.report.robots
+                    if robot.lost)
+    cause = (row.report.cause or "").replace("_", " ")
+    return f"{cause}: {', '.join(losses)}" if losses else cause
+
+
+def failures(rows: Sequence[Row]) -> dict[str, list[int]]:
+    """Cause -> numbers of the missions that failed for it, the most frequent first."""
+    found: dict[str, list[int]] = {}
+    for row in rows:
+        if not row.report.success:
+            found.setdefault(failure_label(row), []).append(row.number)
+    return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+
+
+def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Contender],
+            seed: int) -> list[dict[str, Any]]:
+    """Async over barrier, and another engine over the native one: seconds and moves on the
+    missions that both solved.
+    """
+    found = []
+    for (site, site_seed, name), rows in groups.items():
+        for other in _others(by_name[name]):
+            before = {row.number: row for row in groups.get((site, site_seed, other), [])}
+            pairs = [(row.report, before[row.number].report) for row in rows
+                     if row.number in before]
+            both = [(a, b) for a, b in pairs if a.success and b.success]
+            if not both:
+                continue
+            boot = Bootstrap(len(both), seed)
+            figures = {key: boot.ratio(*zip(*((getattr(a, key), getattr(b, key))
+                                              for a, b in both), strict=True))
+                       for key in ("seconds", "moves")}
+            found.append({
+                "site": site, "site_seed": site_seed, "contender": name, "over": other,
+                "missions": len(pairs), "both_solved": len(both),
+                "only_this": sum(a.success and not b.success for a, b in pairs),
+                "only_other": sum(b.success and not a.success for a, b in pairs),
+                **{key: _plain(figure.value) for key, figure in figures.items()},
+                "intervals": {key: _ends(figure) for key, figure in figures.items()}})
+    return found
+
+
+def _others(one: Contender) -> list[str]:
+    """Names of the contenders that one is held against."""
+    changes = [{"mode": "barrier"}] if one.mode == "async" else []
+    changes += [{"backend": "native"}] if one.backend != "native" else []
+    return [msgspec.structs.replace(one, **change).name for change in changes]
+
+
+def differences(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Contender]
+                ) -> list[dict[str, Any]]:
+    """Missions in which success or decisions are not those of the native engine."""
+    found = []
+    for (site, site_seed, name), rows in groups.items():
+        if by_name[name].backend == "native":
+            continue
+        other = msgspec.structs.replace(by_name[name], backend="native").name
+        before = {row.number: row for row in groups.get((site, site_seed, other), [])}
+        for row in rows:
+            twin = before.get(row.number)
+            if twin is None or _course(row) == _course(twin):
+                continue
+            found.append({"site": site, "site_seed": site_seed, "number": row.number,
+                          "contender": name, "over": other, "this": _told(row),
+                          "other": _told(twin), "why": _why(row, twin)})
+    return found
+
+
+def _course(row: Row) -> tuple[bool, int]:
+    return row.report.success, row.report.decisions
+
+
+def _told(row: Row) -> str:
+    report = row.report
+    end = "solved" if report.success else failure_label(row)
+    return f"{end}, {report.decisions} decisions, {report.seconds:.1f} s"
+
+
+def _why(row: Row, twin: Row) -> str:
+    """What the robots' logs say otherwise."""
+    said = [f"{a.name}: {key.replace('_', ' ')} {getattr(a, key)} against {getattr(b, key)}"
+            for a, b in zip(row.report.robots, twin.report.robots, strict=True)
+            for key in ("timeouts", "wrong_cells", "falls", "stuck", "lost")
+            if getattr(a, key) != getattr(b, key)]
+    return "; ".join(said) or "the same time-outs and wrong cells; one more or one less move"
+
+
+def notes(options: dict[str, Any]) -> list[str]:
+    """What must be known to read the tables."""
+    found = ["seconds, decisions, energy: means over the missions that succeeded; brackets: 95 % "
+             "bootstrap intervals over missions",
+             "decisions / plan: over those of the same planner on the grid alone; seconds / ideal: "
+             "over the grid plan at travelling speed"]
+    drawn = {key: value for key, value in options.get("rates", {}).items() if value}
+    if drawn:
+        found.append("events drawn: " + ", ".join(f"{k} {v:g}" for k, v in drawn.items())
+                     + "; success of solvable leaves out missions that the events themselves "
+                     "made unsolvable")
+    return found
+
+
+Table = tuple[list[str], list[list[str]]]
+
+COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
+            "seconds, ratio", "moves, ratio"]
+DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what differs"]
+"""Titles of the comparisons and of the differences between engines."""
+
+
+def tables(report: dict[str, Any]) -> list[Table]:
+    """The summary, the comparison of modes and the failures, for Markdown or a terminal."""
+    events = any(report["options"].get("rates", {}).values())
+    titles = ["site", "loop", "planner", "mode", "success"]
+    titles += ["of solvable"] if events else []
+    titles += ["seconds", "decisions", "decisions / plan", "seconds / ideal", "wrong cell",
+               "time-outs", "replans", "fell", "stuck"]
+    rows = []
+    for line in report["summary"]:
+        physical = line["loop"] != "grid"
+        cells = [f"{line['site']} {line['site_seed']}", line["loop"], line["planner"],
+                 _mode(line),
+                 f"{line['solved']} of {line['missions']}, {spread(line, 'success', 3)}"]
+        if events:
+            cells.append(f"{line['solved']} of {line['solvable']}, "
+                         + spread(line, "success_solvable", 3))
+        cells += [spread(line, "seconds", 1), spread(line, "decisions", 1)]
+        cells += [spread(line, "inflation", 3), spread(line, "slowdown", 2),
+                  spread(line, "wrong_cell_rate", 4), spread(line, "timeout_rate", 4),
+                  _value(line["replans"], 2), str(line["falls"]), str(line["stuck"])
+                  ] if physical else ["-"] * 7
+        rows.append(cells)
+    found: list[Table] = [(titles, rows)]
+    if report["comparisons"]:
+        found.append((COMPARED,
+                      [[*map(str, row)] for row in compared_rows(report, spread)]))
+    if report["differences"]:
+        found.append((DIFFERENT, [[*map(str, row)] for row in different_rows(report)]))
+    causes = [[f"{line['site']} {line['site_seed']}", line["contender"], cause, str(len(numbers)),
+               _numbers(numbers)]
+              for line in report["failures"] for cause, numbers in line["causes"].items()]
+    if causes:
+        found.append((["site", "contender", "cause of failure", "missions", "numbers"], causes))
+    return found
+
+
+def compared_rows(report: dict[str, Any], write: Callable[[dict[str, Any], str, int], Any]
+                  ) -> list[list[Any]]:
+    """Cells under `COMPARED`; `write` makes one of a figure with its interval, as `spread` does."""
+    return [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
+             f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
+             write(c, "seconds", 3), write(c, "moves", 3)] for c in report["comparisons"]]
+
+
+def different_rows(report: dict[str, Any]) -> list[list[Any]]:
+    """Cells under `DIFFERENT`."""
+    return [[f"{d['site']} {d['site_seed']}", d["number"], d["contender"], d["this"],
+             d["over"], d["other"], d["why"]] for d in report["differences"]]
+
+
+def _mode(line: dict[str, Any]) -> str:
+    """The mode where there is one, and the engine where it is not the native one."""
+    words = [line["mode"]] if line["loop"] in ("closed", "oracle") else []
+    words += [line["backend"]] if line["backend"] != "native" else []
+    return " ".join(words) or "-"
+
+
+def csv_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """One flat row a mission and contender."""
+    found = []
+    for row in rows:
+        report = row.report
+        plan = report.grid_plan
+        flat: dict[str, Any] = {
+            "number": row.number, "site": row.site, "site_seed": row.site_seed, "seed": row.seed,
+            "contender": row.contender, "success": int(report.success),
+            "solvable": int(row.solvable), "cause": report.cause or "",
+            "failure": "" if report.success else failure_label(row), "detail": report.detail,
+            "seconds": report.seconds, "nominal_s": row.nominal_s,
+            "decisions": report.decisions, "plan_decisions": plan.makespan if plan else None,
+            "moves": report.moves, "plan_moves": plan.moves if plan else None,
+            "targets": len(report.targets), "solved": sum(t.solved for t in report.targets),
+            "replans": sum(report.replans.values())}
+        for robot in report.robots:
+            for key in ("kind", "lost", "moves", "arrivals", "timeouts", "wrong_cells",
+                        "seconds_per_move", "cross_track_rms_m", "cross_track_p95_m",
+                        "max_tilt_deg", "slip", "distance_m", "energy_j", "propellant_kg"):
+                flat[f"{robot.name}_{key}"] = getattr(robot, key)
+        found.append(flat)
+    return found
+
+
+MOST_NUMBERS = 12
+"""Mission numbers that a table names of each cause; report.json has all."""
+
+
+def _numbers(numbers: Sequence[int]) -> str:
+    more = len(numbers) - MOST_NUMBERS
+    return ", ".join(map(str, numbers[:MOST_NUMBERS])) + (f" and {more} more" if more > 0 else "")
+
+
+def spread(line: dict[str, Any], key: str, digits: int) -> str:
+    """A figure with its interval in brackets."""
+    low, high = line["intervals"][key]
+    if low is None or high is None:
+        return _value(line[key], digits)
+    return f"{_value(line[key], digits)} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def _value(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _plain(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None
+
+
+def _ends(figure: Figure) -> list[float | None]:
+    return [_plain(figure.low), _plain(figure.high)]

@@ -1,0 +1,1 @@
+"""How fast planners and environments are."""

@@ -1,0 +1,1 @@
+"""Trials of single robots: traverses, slopes, speed, and their films."""

@@ -1,0 +1,190 @@
+"""Plans for large teams and many targets: insertion with regret, then large neighbourhoods.
+
+Anytime: there is a plan after the first insertion, and it gets better with every iteration.
+The search itself is in `insertion`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from moonteam.errors import InputError
+from moonteam.planners.base import IntArray, Objective, Snapshot
+from moonteam.planners.plans.follow import Answer, RoutePlanner
+from moonteam.planners.search import insertion
+from moonteam.planners.search.bounds import lower_bounds
+from moonteam.planners.search.task import Task, value_of, weights
+
+MAX_AGENTS = 30
+"""Coalitions are bit masks of 32 bits."""
+
+_HOT, _COLD = 2.0, 0.1  # temperatures in units of one step (or move)
+_STEER = 0.05  # weight of moves while searching for makespan: it breaks ties on plateaus
+_BLOCK = 250  # iterations between looks at the clock
+
+
+@dataclass
+class Events:
+    """A list of events: targets in order, each with its coalition as a bit mask."""
+
+    order: IntArray  # [M]
+    team: IntArray  # [M]
+
+    def copy(self) -> Events:
+        """A list of its own."""
+        return Events(self.order.copy(), self.team.copy())
+
+    def routes(self, agents: int) -> IntArray:
+        """Each agent's targets in order [N, M], padded by -1."""
+        out = np.full((agents, len(self.order)), -1, np.int32)
+        for a in range(agents):
+            mine = self.order[self.team >> a & 1 == 1]
+            out[a, :len(mine)] = mine
+        return out
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What the search is steered by, and what the best is kept by."""
+
+    alpha: float
+    beta: float
+    true_alpha: float
+    true_beta: float
+
+    @classmethod
+    def of(cls, objective: Objective, alpha: float, beta: float, task: Task) -> Weights:
+        """Weights for an objective; raises InputError if they are not allowed."""
+        true = weights(objective, alpha, beta, len(task.start), task.horizon)
+        steer = (1.0, _STEER) if objective == "makespan" else true
+        return cls(*steer, *true)
+
+    @property
+    def unit(self) -> float:
+        """What one step, or else one move, costs."""
+        return max(self.alpha, self.beta)
+
+
+def insert(task: Task, goal: Weights, regret: bool) -> Events:
+    """A list of events made by insertion, with regret or cheapest first."""
+    agents, count = task.start.shape
+    masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
+    events = Events(np.zeros(count, np.int32), np.zeros(count, np.int32))
+    insertion.insert_all(
+        np.arange(count, dtype=np.int32), regret, task.start, task.between, task.kinds,
+        events.order, events.team, 0, np.zeros(count, np.int32), np.zeros(count, np.int32),
+        np.zeros((count + 1, agents), np.int32), masks, first, goal.alpha, goal.beta,
+        task.horizon, 0.0)
+    return events
+
+
+def measure(task: Task, events: Events) -> tuple[int, int]:
+    """(makespan, moves) of a list."""
+    agents, count = task.start.shape
+    return insertion.measure(
+        task.start, task.between, task.kinds, events.order, events.team, count,
+        np.zeros(count, np.int32), np.zeros(count, np.int32),
+        np.zeros((count + 1, agents), np.int32))
+
+
+def cost(task: Task, goal: Weights, events: Events) -> float:
+    """Cost of a list in the true objective, steps past the horizon charged."""
+    return insertion.price(*measure(task, events), goal.true_alpha, goal.true_beta, task.horizon)
+
+
+def best_insertion(task: Task, goal: Weights) -> Events:
+    """The better of the two insertions."""
+    tries = [insert(task, goal, regret) for regret in (True, False)]
+    return min(tries, key=lambda events: cost(task, goal, events))
+
+
+def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: int | None,
+            until: float | None) -> Events:
+    """The best list found from `events` on.
+
+    Args:
+      task: what is to be done.
+      goal: the weights.
+      events: where to begin.
+      seed: of the random numbers.
+      iterations: budget; with it alone the result depends on nothing but the seed.
+      until: `time.perf_counter()` at which to stop.
+    """
+    masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
+    now, best = events.copy(), events.copy()
+    began, done = time.perf_counter(), 0
+    cooling = math.log(_COLD / _HOT)
+    while len(task.targets) > 1 and iterations != 0:
+        clock = time.perf_counter()
+        shares = [done / iterations] if iterations is not None else []
+        if until is not None:
+            shares.append((clock - began) / max(until - began, 1e-9))
+        share = max(shares)
+        if share >= 1.0:
+            break
+        block = _BLOCK if iterations is None else min(_BLOCK, iterations - done)
+        hot = goal.unit * _HOT * math.exp(cooling * share)
+        insertion.improve(
+            task.start, task.between, task.kinds, masks, first, now.order, now.team,
+            goal.alpha, goal.beta, goal.true_alpha, goal.true_beta, task.horizon, block,
+            hot, hot, seed + done, best.order, best.team)
+        done += block
+    return best
+
+
+class InsertionPlanner(RoutePlanner):
+    """What the greedy and the large-neighbourhood planner share: insertion alone."""
+
+    name = "insertion"
+
+    def _answer(self, task: Task, began: float) -> Answer:
+        agents = len(task.start)
+        if agents > MAX_AGENTS:
+            raise InputError(f"--planner {self.name}",
+                             f"{agents} agents; at most {MAX_AGENTS} are allowed")
+        low_makespan, low_moves = lower_bounds(task)
+        bound = value_of(self.objective, self.alpha, self.beta, low_makespan, low_moves)
+        if low_makespan > task.horizon:
+            return Answer(None, bound, True)
+        goal = Weights.of(self.objective, self.alpha, self.beta, task)
+        events = self._improved(task, goal, best_insertion(task, goal), began)
+        if measure(task, events)[0] > task.horizon:
+            return Answer(None, bound, False)
+        return Answer(events.routes(agents), bound, False)
+
+    def _improved(self, task: Task, goal: Weights, events: Events, began: float) -> Events:
+        return events
+
+
+class LnsPlanner(InsertionPlanner):
+    """Insertion with regret, then large-neighbourhood search; to 10 agents and 60 targets.
+
+    Args:
+      objective: makespan, moves or weighted.
+      alpha: weight of the makespan in the weighted objective.
+      beta: weight of the moves in the weighted objective.
+      iterations: budget; None: 2000 unless there is a time limit.
+      time_limit: seconds; with it the result depends on the machine's speed.
+      seed: of the random numbers.
+    """
+
+    name = "lns"
+
+    def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
+                 iterations: int | None = None, time_limit: float | None = None, seed: int = 0):
+        super().__init__(objective, alpha, beta)
+        self.iterations = 2000 if iterations is None and time_limit is None else iterations
+        self.time_limit, self.seed = time_limit, seed
+
+    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
+        """Starts a mission; the seed is that of the search."""
+        super().reset(snapshot, seed)
+        self.seed = seed
+
+    def _improved(self, task: Task, goal: Weights, events: Events, began: float) -> Events:
+        until = None if self.time_limit is None else began + self.time_limit
+        return improve(task, goal, events, self.seed, self.iterations, until)

@@ -1,0 +1,1 @@
+"""From routes to plans, followed and drawn."""

@@ -1,0 +1,114 @@
+"""Planners that plan the whole mission and follow the plan until the world differs from it."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from moonteam.planners import simulate
+from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
+from moonteam.planners.plans.routes import Certificate, infeasible, obstacles, plan_of_routes
+from moonteam.planners.search.task import Task, weights
+from moonteam.planners.search.travel import travel_times
+
+
+def same_moment(one: Snapshot, other: Snapshot) -> bool:
+    """Whether two snapshots pose the same problem (the step count aside)."""
+    fields = ("cells", "solved", "target_cells", "target_skills", "target_and", "agent_mask",
+              "passable")
+    return all(np.array_equal(getattr(one, f), getattr(other, f)) for f in fields)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a search says of a task.
+
+    `routes` [N, *] are indices of open targets padded by -1, None if there is no plan within
+    the horizon; `bound` is a lower bound of the objective; `proved` that none is better (or
+    that there is none).
+    """
+
+    routes: IntArray | None
+    bound: float
+    proved: bool
+
+
+class RoutePlanner(ABC):
+    """A Planner made of a search for routes: asked once, followed while all goes as foreseen.
+
+    When the team cannot solve every target, or not in the steps left, `act` still works on
+    those it can solve.
+
+    Args:
+      objective: makespan (with few moves as the second wish), moves, or weighted.
+      alpha: weight of the makespan in the weighted objective.
+      beta: weight of the moves in the weighted objective.
+    """
+
+    name: str
+
+    def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05):
+        weights(objective, alpha, beta, 1, 1)
+        self.objective: Objective = objective
+        self.alpha, self.beta = alpha, beta
+        self.replans = 0
+        self._actions: list[IntArray] = []
+        self._expected: Snapshot | None = None
+
+    @abstractmethod
+    def _answer(self, task: Task, began: float) -> Answer:
+        """Routes for a task that skills and ways allow; `began` is a `time.perf_counter()`."""
+
+    def plan(self, snapshot: Snapshot) -> Plan:
+        """A whole plan from this moment. Raises InputError if the planner cannot serve it."""
+        began = time.perf_counter()
+        agents = len(snapshot.cells)
+        travel = travel_times(snapshot)
+        hopeless = obstacles(snapshot, travel)
+        if hopeless:
+            return infeasible(self.name, self.objective, "; ".join(hopeless.values()),
+                              time.perf_counter() - began, agents)
+        task = Task.of(snapshot, travel)
+        answer = self._answer(task, began) if len(task.targets) else Answer(
+            np.full((agents, 0), -1, np.int32), 0.0, True)
+        seconds = time.perf_counter() - began
+        if answer.routes is None:
+            found = "is" if answer.proved else "was found"
+            reason = f"no plan {found} within the {task.horizon} steps left"
+            return infeasible(self.name, self.objective, reason.replace("plan is", "plan"),
+                              seconds, agents)
+        claim = Certificate(self.name, self.objective,
+                            "optimal" if answer.proved else "feasible", answer.bound)
+        return plan_of_routes(snapshot, travel, task.named(answer.routes), claim, seconds)
+
+    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
+        """Starts a mission; planners without chance ignore the seed."""
+        self._actions = []
+        self._expected = None
+        self.replans = 0
+
+    def act(self, snapshot: Snapshot) -> IntArray:
+        """Joint action [N]: the plan's next, or the first of a new plan."""
+        if self._expected is None or not same_moment(snapshot, self._expected):
+            self.replans += 1
+            self._actions = list(self._best_effort(snapshot).actions)
+        if self._actions:
+            joint = self._actions.pop(0)
+        else:
+            joint = np.full(len(snapshot.cells), simulate.STAY, np.int32)
+        held = replace(snapshot, solved=simulate.holding(snapshot))
+        self._expected = simulate.step(held, joint)
+        return joint
+
+    def _best_effort(self, snapshot: Snapshot) -> Plan:
+        plan = self.plan(snapshot)
+        if plan.status != "infeasible":
+            return plan
+        hopeless = list(obstacles(snapshot, travel_times(snapshot)))
+        solved = snapshot.solved.copy()
+        solved[hopeless] = True
+        longer = max(snapshot.max_steps, snapshot.step + 1) * 64
+        return self.plan(replace(snapshot, solved=solved, max_steps=longer))

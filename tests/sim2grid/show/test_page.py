@@ -1,0 +1,148 @@
+"""HTML pages: whole, escaped, self-contained; the evaluation's page says what its report says."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from sim2grid.frame import Frame
+from sim2grid.measure.metrics import GridPlan, make_report
+from sim2grid.measure.story import Story
+from sim2grid.show import page, plots
+from sim2grid.study.evaluation_page import evaluation_page
+
+VOID = {"meta", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Reads a page; fails on tags that do not match, collects words and addresses."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.words, self.addresses, self.tags = [], [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for key, value in attrs if key in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture
+def done(mission, execute, script):
+    spec = mission(["a drone A 0 0", "b wheeled B 3 0"], ["A OR 0 1", "B OR 2 0"],
+                   events=[{"at_decision": 1, "slow": {"robot": "a", "factor": 0.5}}])
+    execution = execute(spec, script("right stay", "left left", "up stay"))
+    report = make_report(execution.record, spec, Frame((4, 4), 1.0), [0, 7], planner="exact",
+                         objective="makespan", mode="barrier", backend="native", seed=3,
+                         grid_plan=GridPlan(True, 2, 2))
+    return report, Story(spec, execution.record, Frame((4, 4), 1.0), [0, 7])
+
+
+def test_a_rollouts_page_is_whole_and_needs_nothing_else(done, tmp_path):
+    report, story = done
+    (tmp_path / "video.mp4").write_bytes(b"moving pictures")
+    text = page.rollout_page(
+        report, command="moonteam rollout demo", made=tmp_path / "video.mp4", out=tmp_path,
+        replans=[(r.time_s, r.decision, r.words) for r in story.replans],
+        plots=[("When", plots.timeline(story)), ("Motion", plots.motion(story, [0, 7]))])
+    read = Reader(text)
+    assert all(address.startswith("data:") for address in read.addresses)
+    assert "@import" not in text
+    assert {"video", "img", "table"} <= set(read.tags)
+    for word in ("success", "2 of 2", "a slowed", "moonteam rollout demo", "T1", "wheeled"):
+        assert word in read.text
+
+
+def test_words_from_outside_are_escaped():
+    assert page.cell("<b>&") == "&lt;b&gt;&amp;"
+    assert page.cell(page.Raw("<b>")) == "<b>"
+    assert "<script>" not in page.page("<script>", [page.table(["<script>"], [["<script>"]])])
+
+
+def test_cells_for_a_person():
+    assert page.cell(1234.567) == "1,234.57"
+    assert "-" in page.cell(None)
+    assert "-" in page.cell(float("nan"))
+    assert "yes" in page.cell(True)
+    assert 'class="n"' in page.table(["x"], [[1.0], [None]])
+    assert 'class="n"' not in page.table(["x"], [[1.0], ["one"]])
+
+
+def test_a_large_video_is_linked_and_a_missing_one_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "LARGEST_VIDEO", 10)
+    file = tmp_path / "deep" / "video.mp4"
+    file.parent.mkdir()
+    file.write_bytes(b"0" * 11)
+    assert 'href="deep/video.mp4"' in page.video(file, tmp_path)
+    assert "No video" in page.video(None, tmp_path)
+
+
+def row(number, contender, success, seconds, cause=None):
+    return {"number": number, "contender": contender, "site": "mare", "site_seed": 0,
+            "report": {"success": success, "seconds": seconds, "inflation": 1.5 if success
+                       else None, "cause": cause, "detail": "T1 & T2 not solved"}}
+
+
+@pytest.fixture
+def document():
+    summary = {"site": "mare", "site_seed": 0, "contender": "closed exact barrier", "solved": 1,
+               "missions": 2, "falls": 1, "stuck": 0, "replans_by_cause": {"wrong_cell": 3},
+               "success": 0.5, "seconds": 40.0, "intervals": {"success": [0.0, 1.0],
+                                                               "seconds": [None, None]}}
+    return {
+        "title": "executions in physics", "meta": {"command": "moonteam evaluate execution"},
+        "options": {}, "contenders": [{"name": "closed exact barrier", "loop": "closed"},
+                                      {"name": "grid exact", "loop": "grid"}],
+        "summary": [summary], "comparisons": [], "notes": ["a note"], "missions": [{}, {}],
+        "failures": [{"site": "mare", "site_seed": 0, "contender": "closed exact barrier",
+                      "causes": {"max steps: legged fallen": [17]}}],
+        "rows": [row(3, "closed exact barrier", True, 40.0),
+                 row(17, "closed exact barrier", False, 90.0, "max_steps"),
+                 row(17, "grid exact", False, 9.0, "max_steps")]}
+
+
+def test_the_evaluations_page_names_every_failure_and_the_command_that_shows_it(document):
+    read = Reader(evaluation_page(document, "runs/x/report.json"))
+    assert all(address.startswith("data:") for address in read.addresses)
+    command = "moonteam rollout --from runs/x/report.json --mission 17 --contender " \
+        "'closed exact barrier'"
+    assert read.text.count(command) == 1, "what has no physics has no video"
+    for word in ("0.500 [0.000, 1.000]", "max steps: legged fallen", "T1 & T2 not solved",
+                 "wrong cell 3", "a note"):
+        assert word in read.text
+
+
+def test_an_evaluation_without_failures_or_rows_is_still_a_page(document):
+    document |= {"rows": [], "summary": [], "failures": [], "interrupted": True}
+    assert "Interrupted" in Reader(evaluation_page(document)).text
+
+
+def test_plots_are_the_same_for_the_same_data():
+    groups = {"one": [1.0, 2.0, 2.5], "two": [2.0]}
+    first = plots.histograms("seconds", groups)
+    assert first == plots.histograms("seconds", groups)
+    assert re.match(r"<\?xml.*<svg", first, re.DOTALL)
+    assert plots.histograms("seconds", {"none": []}) == ""
+    line = {"a": [(0.0, (1.0, 0.9, 1.0)), (1.0, None)]}
+    assert "<svg" in plots.svg(plots.curves([("slope", line, line)]))
+
+
+def test_plots_of_a_long_record_stay_small(done):
+    _, story = done
+    story.times = np.linspace(0, 1, 10_000)
+    assert len(plots._thinned(len(story.times))) == plots.MOST_POINTS

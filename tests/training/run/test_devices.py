@@ -1,0 +1,65 @@
+"""One device, four devices, two processes of two: the same curve."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from moonteam.cli import main
+from tests.training.run.test_loop import words
+
+FIGURES = ("success", "makespan", "moves", "mean_reward", "value_loss", "entropy")
+
+
+def train(out, devices, *more):
+    """Starts the command in a process that has so many devices."""
+    environment = dict(os.environ, JAX_NUM_CPU_DEVICES=str(devices), JAX_PLATFORMS="cpu")
+    return subprocess.Popen([sys.executable, "-m", "moonteam.cli", *words(out, *more)],
+                            env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+                            text=True)
+
+
+def finished(*runs):
+    for run in runs:
+        _, err = run.communicate(timeout=500)
+        assert run.returncode == 0, err
+
+
+def curve(out):
+    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    return np.array([[row[key] for key in FIGURES] for row in rows])
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The curve of one device."""
+    out = tmp_path_factory.mktemp("alone") / "run"
+    finished(train(out, 1))
+    return curve(out)
+
+
+def test_four_devices_give_the_same_curve(alone, tmp_path):
+    finished(train(tmp_path / "run", 4))
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["device"].startswith("4 x")
+    np.testing.assert_allclose(curve(tmp_path / "run"), alone, rtol=1e-3, atol=1e-4)
+
+
+def test_two_processes_of_two_give_the_same_curve(alone, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = ["--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process"]
+    finished(*[train(tmp_path / "run", 2, *shared, str(i)) for i in range(2)])
+    np.testing.assert_allclose(curve(tmp_path / "run"), alone, rtol=1e-3, atol=1e-4)
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["device"].startswith("4 x")
+
+
+def test_a_process_that_cannot_be(tmp_path, capsys):
+    assert main(words(tmp_path / "run", "--coordinator", "127.0.0.1:1", "--processes", "2",
+                      "--process", "2")) == 2
+    assert "--process: 2 is not allowed; 0 to 1" in capsys.readouterr().err

@@ -1,0 +1,375 @@
+"""Runs that are stopped, killed, torn and resumed end as one that never was."""
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from moonteam.cli import main
+from moonteam.errors import InputError
+from moonteam.grid import env
+from training.run import checkpoints, loop, record
+from training.run.config import BOOTSTRAP, REFINEMENT, Config, Phase
+from training.run.loop import Run, Stop
+
+TINY = Config(
+    "small", Phase(4, 8, 2, BOOTSTRAP), Phase(6, 8, 2, REFINEMENT), num_agents=2, num_targets=2,
+    size=(4, 4), max_steps=8, num_steps=8, width=8, update_epochs=1, chunk_updates=2,
+    eval_every=2, eval_scenarios=8)
+
+
+def words(out, *more):
+    """The command line that trains TINY."""
+    given = {"num-agents": 2, "num-targets": 2, "max-steps": 8, "num-steps": 8, "width": 8,
+             "approach-decay": 0.0075, "gamma": 0.99,
+             "update-epochs": 1, "chunk-updates": 2, "eval-every": 2, "eval-scenarios": 8,
+             "bootstrap.updates": 4, "bootstrap.num-envs": 8, "bootstrap.num-minibatches": 2,
+             "bootstrap.lr": 2e-3, "refinement.ent-coef": 0.01,
+             "refinement.updates": 6, "refinement.num-envs": 8, "refinement.num-minibatches": 2,
+             "refinement.lr": 2e-3}
+    options = [word for key, value in given.items() for word in (f"--{key}", str(value))]
+    return ["train", "small", "--size", "4", "4", *options, "--out", str(out), *more]
+
+
+def bits(run):
+    return jax.tree.leaves(jax.device_get(run.learner.params))
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run."""
+    run = Run(TINY, tmp_path_factory.mktemp("whole"), resume=False)
+    assert run.train(Stop())
+    return run
+
+
+def stopped(out, *at):
+    """A run stopped after so many updates, and gone on with, each time from disk."""
+    for number, updates in enumerate(at):
+        run = Run(TINY, out, resume=number > 0)
+        assert not run.train(Stop(), stop_after=updates)
+    return Run(TINY, out, resume=bool(at))
+
+
+def test_resumed_twice_is_bit_identical(whole, tmp_path):
+    run = stopped(tmp_path, 2, 6)
+    assert run.position.phase == "refinement"
+    assert run.position.total_updates == 6
+    assert run.train(Stop())
+    assert same(bits(run), bits(whole))
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["total_updates"] for row in rows] == [2, 4, 6, 8, 10]
+    assert {"argmax", "sample", "success", "makespan", "rate"} <= rows[1].keys()
+
+
+def test_another_seed_is_another_run(whole, tmp_path):
+    run = Run(dataclasses.replace(TINY, seed=1), tmp_path, resume=False)
+    run.train(Stop())
+    assert not same(bits(run), bits(whole))
+
+
+def test_refinement_keeps_the_weights_and_takes_a_fresh_optimiser(tmp_path):
+    run = stopped(tmp_path, 4)
+    before = bits(run)
+    run.learner = run.begin(1, run.learner.params)
+    assert same(bits(run), before)
+    counts = [leaf for leaf in jax.tree.leaves(run.learner.optimiser) if leaf.ndim == 0]
+    assert counts
+    assert all(int(count) == 0 for count in counts)
+    weights = [run.task(phase).config.weights for _, phase in TINY.phases]
+    assert [(w.SC, w.TC, w.TB) for w in weights] == [(0, 0, 0), (0.3, 0.5, 0.2)]
+
+
+@pytest.mark.parametrize("harm", ["truncate", "flip", "no about", "half about"])
+def test_a_torn_checkpoint_is_passed_over_with_a_warning(whole, tmp_path, harm):
+    stopped(tmp_path, 2, 6)
+    newest = checkpoints.newest(tmp_path / "checkpoints")
+    assert newest.name == "00000006"
+    largest = max((p for p in (newest / "learner").rglob("*") if p.is_file()),
+                  key=lambda p: p.stat().st_size)
+    if harm == "truncate":
+        largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+    elif harm == "flip":
+        data = bytearray(largest.read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        largest.write_bytes(bytes(data))
+    elif harm == "no about":
+        (newest / "about.json").unlink()
+    else:
+        (newest / "about.json").write_text('{"phase": "refi')
+    with pytest.warns(UserWarning, match="00000006 is torn"):
+        run = Run(TINY, tmp_path, resume=True)
+    assert run.position.total_updates == 4  # saved for its evaluation, the best until then
+    assert run.train(Stop())
+    assert same(bits(run), bits(whole))
+
+
+def test_killed_and_resumed_is_bit_identical(whole, tmp_path):
+    """SIGKILL once a checkpoint is there, wherever the process then is."""
+    command = [sys.executable, "-m", "moonteam.cli", *words(tmp_path, "--checkpoint-seconds", "0")]
+    child = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"},
+                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 300
+    while checkpoints.newest(tmp_path / "checkpoints") is None:
+        assert child.poll() is None, child.communicate()[1].decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    child.send_signal(signal.SIGKILL)
+    child.communicate()
+    assert main(words(tmp_path, "--resume", "--checkpoint-seconds", "0", "--tensorboard")) == 0
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+    run = Run(TINY, tmp_path, resume=True)
+    assert run.position.total_updates == 10
+    assert same(bits(run), bits(whole))
+    for name in ("config.json", "metrics.jsonl", "report.json", "curve.png", "policy.safetensors"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert main(["train", "compare", str(tmp_path)]) == 0
+
+
+def test_sigterm_while_training_saves_and_the_run_goes_on_from_there(tmp_path):
+    """Checkpoints by the clock are turned off, and so is the one of the best evaluation."""
+    endless = ["--bootstrap.updates", "1000000", "--eval-every", "1000000"]
+    command = [sys.executable, "-m", "moonteam.cli",
+               *words(tmp_path, "--checkpoint-seconds", "1e6", *endless)]
+    child = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"},
+                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    metrics = tmp_path / "metrics.jsonl"
+    deadline = time.monotonic() + 300
+    while len(record.read(metrics)) < 3:
+        assert child.poll() is None, child.communicate()[1].decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert checkpoints.newest(tmp_path / "checkpoints") is None
+    child.send_signal(signal.SIGTERM)
+    line = child.communicate(timeout=300)[1].decode()
+    assert child.returncode == 130, line
+    done = record.read(metrics)[-1]["total_updates"]
+    assert f"interrupted after update {done}, saved; go on with --out {tmp_path} --resume" in line
+    assert checkpoints.newest(tmp_path / "checkpoints").name == f"{done:08d}"
+    config = dataclasses.replace(
+        TINY, eval_every=1000000, bootstrap=dataclasses.replace(TINY.bootstrap, updates=1000000))
+    run = Run(config, tmp_path, resume=True)
+    assert run.position.total_updates == done
+    assert not run.train(Stop(), stop_after=done + 2)
+    updates = [row["total_updates"] for row in record.read(metrics)]
+    assert updates == list(range(2, done + 3, 2))
+
+
+def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        with loop.stop_on_signals() as stop:
+            assert not stop.asked
+            os.kill(os.getpid(), number)
+            assert stop.asked
+    assert signal.getsignal(signal.SIGTERM) is before
+    run = Run(TINY, tmp_path, resume=False)
+    run.train(Stop(), stop_after=2)
+    again = Run(TINY, tmp_path, resume=True)
+    assert not again.train(Stop(asked=True))
+    assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def test_an_interrupted_command_saves_and_returns_130(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Run, "train", lambda self, stop: False)
+    assert main(words(tmp_path)) == 130
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_not_a_number_names_the_last_good_checkpoint(tmp_path, capsys):
+    run = stopped(tmp_path, 2)
+    poisoned = jax.tree.map(lambda x: x * np.nan, run.learner.params)
+    run.learner = run.learner._replace(params=poisoned)
+    with pytest.raises(loop.Diverged, match=r"not a number; .*checkpoints/00000002"):
+        run.train(Stop())
+    assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def test_weights_spoiled_by_a_chunks_last_step_are_not_saved_as_good(tmp_path, monkeypatch):
+    run = stopped(tmp_path, 2)
+    real = loop.update.chunk
+
+    def spoiled(*args):
+        learner, report = real(*args)
+        return learner._replace(params=jax.tree.map(lambda x: x * np.nan, learner.params)), report
+
+    monkeypatch.setattr(loop.update, "chunk", spoiled)
+    with pytest.raises(loop.Diverged, match="weight is not a number"):
+        run.train(Stop())
+    assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
+
+
+def looks(*successes):
+    """Rows with evaluations of sampled actions, one every ten updates."""
+    return [{"total_updates": 10 * i, "sample": {"success": s}} for i, s in enumerate(successes, 1)]
+
+
+SMALL = looks(.633, .645, .656, .719, .754, .730, .820, .879, .895, .906, .895, .938, .941, .941,
+              .926, .930, .953, .984, .988, .988, .980, .996, .988, .992)
+"""What `moonteam train small --seed 0` shows."""
+
+
+@pytest.mark.parametrize(("successes", "scenarios", "expected"), [
+    ((0.9, 0.45, 0.4, 0.3), 256, True),
+    ((0.6, 0.9, 0.0, 0.0, 0.0), 256, True),
+    ((0.9, 0.9, 0.3, 0.3), 256, False),  # two only
+    ((0.9, 0.3, 0.3, 0.5, 0.3), 256, False),  # not in a row
+    ((0.9, 0.46, 0.4, 0.3), 256, False),  # more than half of the best
+    ((0.45, 0.1, 0.1, 0.1), 256, False),  # never could do much
+    ((0.6, 0.29, 0.29, 0.29), 16, False),  # chance, on so few scenarios
+    ((0.1, 0.1, 0.1, 0.1), 256, False)])
+def test_a_collapse_is_a_lasting_fall_to_half_of_what_it_could(successes, scenarios, expected):
+    assert record.collapsed(looks(*successes), scenarios) is expected
+
+
+def test_no_false_alarm_in_normal_learning():
+    assert not any(record.collapsed(SMALL[:n], 256) for n in range(len(SMALL) + 1))
+    training = [{"total_updates": n} for n in range(3)]
+    assert not record.collapsed(training, 256)
+    draw = np.random.default_rng(0)
+    for scenarios in (4, 8, 16, 32, 256):  # one policy, measured again and again
+        for ability in (0.3, 0.5, 0.7, 0.95):
+            noisy = looks(*(draw.binomial(scenarios, ability, 400) / scenarios))
+            assert not any(record.collapsed(noisy[:n], scenarios) for n in range(1, 401, 3))
+
+
+def test_the_last_of_equally_good_evaluations_is_the_best():
+    assert record.best(looks(0.5, 0.8, 0.8, 0.7))["total_updates"] == 30
+    assert record.best([{"total_updates": 5}]) is None
+
+
+def test_a_lost_policy_stops_the_run_and_the_best_checkpoint_is_left(tmp_path):
+    """In 48 steps robots that walk about at random solve nearly all; then they are made to stay."""
+    easy = dataclasses.replace(
+        TINY, bootstrap=Phase(40, 8, 2, BOOTSTRAP, lr=1e-5), max_steps=48, eval_every=1,
+        eval_scenarios=64, refinement=dataclasses.replace(TINY.refinement, updates=0))
+    run = Run(easy, tmp_path, resume=False, checkpoint_seconds=0)
+    run.train(Stop(), stop_after=4)
+    good = record.best(run.metrics.rows)
+    assert good["sample"]["success"] > 0.6
+    params = run.learner.params
+    lame = jax.tree.map(lambda x: x.at[env.STAY].add(100.0) if x.shape == (env.NUM_ACTIONS,) else x,
+                        params.actor)  # the bias of the logits
+    run.learner = run.learner._replace(params=params._replace(actor=lame))
+    with pytest.raises(loop.Diverged, match=r"collapsed by update 10 .*sampled actions solve 0\.0"):
+        run.train(Stop())
+    before = tmp_path / "checkpoints" / f"{good['total_updates']:08d}"
+    assert before.is_dir()
+    fresh = tmp_path / "fresh"  # to go on from it: a folder that holds nothing else
+    (fresh / "checkpoints").mkdir(parents=True)
+    before.rename(fresh / "checkpoints" / before.name)
+    again = Run(dataclasses.replace(easy, gamma=0.9), fresh, resume=True)
+    assert again.position.total_updates == good["total_updates"]
+
+
+def test_a_collapse_ends_the_command_with_one_unless_told_otherwise(tmp_path, monkeypatch, capsys):
+    scores = iter([0.9, 0.3, 0.2, 0.4, 0.1] * 3)
+
+    def evaluate(self, phase, scenarios):
+        score = {"success": next(scores), "makespan": 8.0, "moves": 9.0}
+        return {"argmax": score, "sample": score}
+
+    monkeypatch.setattr(Run, "evaluate", evaluate)
+    often = ("--eval-every", "1", "--eval-scenarios", "256", "--checkpoint-seconds", "0")
+    assert main(words(tmp_path / "a", *often)) == 1
+    line = capsys.readouterr().err
+    place = tmp_path / "a" / "checkpoints" / "00000002"
+    assert f"after update 2 it was 0.900; the last good checkpoint is {place} (" in line
+    assert line.count("\n") == 1
+    kept = [path.name for path in sorted(place.parent.iterdir())]
+    assert kept == ["00000002", "00000004", "00000006"]
+    scores = iter([0.9, 0.3, 0.2, 0.4, 0.1] * 3)
+    assert main(words(tmp_path / "b", *often, "--no-stop-on-collapse")) == 0
+    assert (tmp_path / "b" / "report.json").exists()
+    kept = [path.name for path in sorted((tmp_path / "b" / "checkpoints").iterdir())]
+    assert kept == ["00000002", "00000004", "00000006", "00000008", "00000010"]
+
+
+def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
+    stopped(tmp_path, 2)
+    with pytest.raises(InputError, match="already holds a run"):
+        Run(TINY, tmp_path, resume=False)
+    with pytest.raises(InputError, match="gamma: was started with other numbers"):
+        Run(dataclasses.replace(TINY, gamma=0.9), tmp_path, resume=True)
+
+
+def test_beginning_where_another_runs_bootstrap_ended(whole, tmp_path):
+    """The same numbers end with the same bits; others change what comes after, and only that."""
+    end = whole.out / "checkpoints" / "00000004"
+    twin = Run(TINY, tmp_path / "twin", resume=False, begin=end)
+    assert twin.position.total_updates == 4
+    assert (tmp_path / "twin/checkpoints/00000004").is_dir()
+    assert twin.train(Stop())
+    assert same(bits(twin), bits(whole))
+    rows = [record.read(run.out / "metrics.jsonl") for run in (twin, whole)]
+    assert [r["success"] for r in rows[0]] == [r["success"] for r in rows[1]]
+
+    weights = dataclasses.replace(REFINEMENT, AR=0.0)
+    refinement = dataclasses.replace(TINY.refinement, weights=weights)
+    quick = dataclasses.replace(TINY, refinement=refinement)
+    other = Run(quick, tmp_path / "other", resume=False, begin=end)
+    assert same(bits(other), bits(Run(TINY, tmp_path / "start", resume=False, begin=end)))
+    other.train(Stop(), stop_after=6)
+    assert (tmp_path / "other/checkpoints/00000004").is_dir()
+    again = Run(quick, tmp_path / "other", resume=True)
+    assert again.train(Stop())
+    assert not same(bits(again), bits(whole))
+
+
+def test_what_a_run_may_not_begin_with_is_one_line_and_leaves_nothing(whole, tmp_path, capsys):
+    end = whole.out / "checkpoints" / "00000004"
+    torn = tmp_path / "torn"
+    shutil.copytree(end, torn)
+    largest = max((p for p in torn.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[:-7])
+    for place, more, line in (
+            (tmp_path / "none", (), "none: is no whole checkpoint"),
+            (torn, (), "torn: is no whole checkpoint (its checksums do not match)"),
+            (end, ("--width", "16"), "is of another network"),
+            (end, ("--bootstrap.num-envs", "4"), "another network"),
+            (end, ("--bootstrap.updates", "2"), "bootstrap.updates: stands after 4 updates"),
+            (end, ("--resume",), "--begin: is for a new run")):
+        out = tmp_path / "out"
+        assert main(words(out, "--begin", str(place), *more)) == 2
+        found = capsys.readouterr().err
+        assert line in found
+        assert found.count("\n") == 1
+        assert not out.exists()
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    stopped(tmp_path, 2)
+    wider = dataclasses.replace(TINY, width=16)
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(InputError, match="another network"):
+        Run(wider, tmp_path, resume=True)
+    arrays = checkpoints.load(tmp_path / "checkpoints")[1]
+    like = jax.eval_shape(lambda: Run(wider, tmp_path / "w", resume=False).begin(0, None))
+    with pytest.raises(InputError, match=r"another network.*this run needs"):
+        checkpoints.unflatten(arrays, like, "here")
+
+
+def test_a_full_disk_names_the_checkpoint_before(tmp_path, monkeypatch):
+    run = stopped(tmp_path, 2)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoints.files, "write_json", full)
+    with pytest.raises(InputError, match=r"No space left on device; the last good .*00000002"):
+        run.save()
+    monkeypatch.undo()
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000002"]
+    assert checkpoints.load(tmp_path / "checkpoints")[0].total_updates == 2

@@ -1,0 +1,100 @@
+"""What a run leaves while it goes, without training anything."""
+
+import struct
+import sys
+from io import StringIO
+
+import pytest
+
+from moonteam.cli import main
+from moonteam.errors import InputError
+from training.run import record
+from training.run.config import PRESETS
+
+SCORE = {"success": 0.987, "makespan": 14.25, "moves": 26.5}
+
+
+def row(updates, **more):
+    return {"phase": "bootstrap", "total_updates": updates, "env_steps": 100 * updates,
+            "rate": 23456.7, "success": 0.75, "makespan": 20.0, "moves": 31.0} | more
+
+
+def events(folder):
+    """(tag, step, value) of every scalar in the event files, and the steps from which on what
+    was written before is void.
+    """
+    from tensorboardX.proto.event_pb2 import Event
+
+    found, void = [], []
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        data = path.read_bytes()
+        while data:  # a record: length, its checksum, event, its checksum
+            (length,) = struct.unpack("<Q", data[:8])
+            event = Event.FromString(data[12:12 + length])
+            data = data[16 + length:]
+            found += [(v.tag, event.step, v.simple_value) for v in event.summary.value]
+            void += [event.step] if event.HasField("session_log") else []
+    return found, void
+
+
+def test_tensorboard_gets_every_number_of_every_row(tmp_path):
+    metrics = record.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
+    metrics.add(row(1))
+    metrics.add(row(2, argmax=SCORE, sample=SCORE))
+    metrics.close()
+    found, _ = events(tmp_path)
+    assert ("success", 100, 0.75) in found
+    assert ("sample/makespan", 200, 14.25) in found
+    assert len(found) == 6 + 6 + 6
+    assert not any(tag == "phase" for tag, _, _ in found)
+
+
+def test_resumed_events_go_on_where_the_rows_do(tmp_path):
+    first = record.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
+    for updates in (1, 2, 3):
+        first.add(row(updates))
+    first.close()
+    again = record.Metrics(tmp_path / "metrics.jsonl", 2, tensorboard=True)
+    again.add(row(3, success=0.5))
+    again.close()
+    found, void = events(tmp_path)
+    assert [entry for entry in found if entry[0] == "success"][-1] == ("success", 300, 0.5)
+    assert 201 in void
+
+
+def test_without_the_package_one_line_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    assert main(["train", "small", "--tensorboard", "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert "pip install 'moonteam[tensorboard]'" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="is not installed"):
+        record.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
+    record.Metrics(tmp_path / "metrics.jsonl", 0).add(row(1))
+
+
+@pytest.mark.parametrize("name", ["small", "pi_5t5r"])
+def test_the_live_lines_show_everything_on_80_columns(name):
+    from rich.console import Console
+
+    screen = StringIO()
+    console = Console(file=screen, force_terminal=True, width=80, color_system=None)
+    progress = record.Progress(PRESETS[name], 0, console)
+    scores = {"argmax": SCORE | {"makespan": 113.62}, "sample": SCORE}
+    for steps, more in ((5_000_000_000, scores), (6_000_000_000, {})):
+        progress.show(row(1, phase="refinement", **more) | {"env_steps": steps})
+    progress.stop()
+    shown = screen.getvalue()
+    last = shown[shown.rindex(name):]
+    for part in ("refinement", "6,000,000,000 env steps", "23,457/s", "0.987 success",
+                 "113.6 makespan", "26.5 moves", "0:00:0"):
+        assert part in last, last
+    assert "…" not in last
+
+
+def test_no_terminal_no_line(capsys):
+    progress = record.Progress(PRESETS["small"], 0)
+    progress.show(row(1, argmax=SCORE))
+    progress.stop()
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,132 @@
+"""Imitation: labels are the oracle's, memory is a ring, a resumed run is the same run."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from moonteam.errors import InputError
+from moonteam.planners.base import Snapshot
+from moonteam.planners.exact import ExactPlanner
+from moonteam.planners.learned import LearnedPlanner
+from moonteam.policies.entity import EntitySpec
+from moonteam.policies.policy_file import load_policy
+from moonteam.problem.scenario import Agent, Scenario, Target
+from training.commands import imitate
+from training.run import folder
+from training.run.folder import Run
+from training.run.loop import Stop
+from training.teacher.imitation import TIE_BREAK, Dagger, Family, Imitation, Memory, begin, label
+
+SMALL = Family(2, 2, sides=(4, 6), max_steps=24)
+TINY = Imitation(families=(SMALL,), spec=EntitySpec(width=16, heads=2, layers=1), rounds=30,
+                 num_envs=16, capacity=64, batch_size=32, batches=1, lr=5e-3)
+
+
+def test_labels_point_where_the_exact_planner_goes():
+    walk = begin(SMALL, None, jax.random.key(3), 24)
+    sample = label(SMALL, None, walk, threads=1)
+    problem, cells = sample.states.problem, sample.states.cells
+    for e in range(24):
+        wish = float(sample.preference[e])
+        planner = ExactPlanner("weighted", alpha=1 - wish + TIE_BREAK, beta=wish + TIE_BREAK)
+        plan = planner.plan(Snapshot(
+            size=(6, 6), cells=cells[e], agent_skills=problem.agent_skills[e],
+            agent_kinds=problem.agent_kinds[e], agent_mask=problem.agent_mask[e],
+            target_cells=problem.target_cells[e], target_skills=problem.target_skills[e],
+            target_and=problem.target_and[e], solved=sample.states.solved[e]))
+        first = {}
+        for visit in sorted(plan.schedule, key=lambda v: v.step):
+            for agent in visit.agents:
+                first.setdefault(agent, visit.target)
+        pointed = {n: int(t) for n, t in enumerate(sample.pointer[e]) if t < 2}
+        # Whoever is pointed at a target is in the plan's schedule at it, first of all.
+        assert pointed == first
+
+
+def test_memory_is_a_ring():
+    memory = Memory(8)
+    walk = begin(SMALL, None, jax.random.key(0), 4)
+    sample = label(SMALL, None, walk, threads=1)
+    for value in range(3):
+        memory.add(sample._replace(place=np.full(4, value, np.int32)))
+    assert memory.rows is not None
+    np.testing.assert_array_equal(memory.rows.place, [2] * 4 + [1] * 4)
+    drawn = memory.draw(np.random.default_rng(0), 64)
+    assert set(np.asarray(drawn.place)) == {1, 2}
+
+
+def test_learning_lowers_the_loss():
+    dagger = Dagger(TINY)
+    losses = [float(dagger.round().loss) for _ in range(30)]
+    assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
+
+
+@pytest.mark.parametrize("family", [SMALL, Family(3, 2, sides=(6, 6), max_steps=24, grounds=3)],
+                         ids=["open", "blocked"])
+def test_a_resumed_run_is_the_same_run(tmp_path, family, monkeypatch):
+    monkeypatch.setattr(folder, "SCENARIOS", 8)
+    config = dataclasses.replace(TINY, families=(family,))
+    whole = Run("tiny", "imitation", Dagger(config), tmp_path / "whole", False)
+    assert whole.train(Stop())
+    begun = Run("tiny", "imitation", Dagger(config), tmp_path / "parts", False)
+    begun.work.round()
+    begun.work.round()
+    begun.save()
+    again = Run("tiny", "imitation", Dagger(config), tmp_path / "parts", True)
+    assert again.work.number == 2
+    assert again.train(Stop())
+    for a, b in zip(jax.tree.leaves(whole.work.learner), jax.tree.leaves(again.work.learner),
+                    strict=True):
+        np.testing.assert_array_equal(a, b)
+    report = again.finish()
+    assert 0 <= report["families"][0]["success"] <= 1
+    planner = LearnedPlanner.load(tmp_path / "parts" / "policy.safetensors", preference=1.0)
+    other_size = Scenario(size=(5, 9), agents=(Agent((0, 0), ("A",)),),
+                          targets=(Target((4, 8), ("A",), "OR"), Target((2, 2), ("A",), "OR")))
+    start = Snapshot.start(other_size)
+    planner.reset(start)
+    assert planner.act(start).shape == (1,)
+    with pytest.raises(InputError, match="already holds a run"):
+        Run("tiny", "imitation", Dagger(config), tmp_path / "parts", False)
+    other = dataclasses.replace(config, lr=1.0)
+    with pytest.raises(InputError, match="other numbers"):
+        Run("tiny", "imitation", Dagger(other), tmp_path / "parts", True)
+
+
+def test_a_torn_state_is_named(tmp_path):
+    run = Run.__new__(Run)
+    run.state_file = tmp_path / "state.npz"
+    run.state_file.write_bytes(b"PK\x03\x04 torn")
+    run.work = Dagger.__new__(Dagger)
+    with pytest.raises(InputError, match="is torn"):
+        run._load()
+
+
+def test_impossible_numbers():
+    with pytest.raises(InputError, match="the planner takes 1 to 12"):
+        Imitation(families=(Family(3, 20),))
+    Imitation(families=(Family(3, 20, iterations=50),))
+    with pytest.raises(InputError, match="capacity"):
+        dataclasses.replace(TINY, capacity=50)
+
+
+def test_a_run_begins_with_another_ones_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder, "SCENARIOS", 4)
+    monkeypatch.setitem(imitate.PRESETS, "quick", TINY)
+    first = Run("tiny", "imitation", Dagger(dataclasses.replace(TINY, rounds=1)), tmp_path / "a",
+                False)
+    assert first.train(Stop())
+    first.finish()
+    policy = tmp_path / "a" / "policy.safetensors"
+    words = ["quick", "--begin", str(policy), "--rounds", "1", "--lr", "1e-9", "--json"]
+    assert imitate.run(imitate.parse([*words, "--out", str(tmp_path / "b")])) == 0
+    before, after = (load_policy(tmp_path / name / "policy.safetensors") for name in "ab")
+    for a, b in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-7)
+    assert after.recipe["source"] == str(policy)
+    with pytest.raises(InputError, match="only entity policies"):
+        imitate.run(imitate.parse(["quick", "--begin", "small"]))
+    with pytest.raises(InputError, match="above 0"):
+        imitate.run(imitate.parse(["quick", "--lr", "0"]))

@@ -1,0 +1,1 @@
+"""The learner measured, alone and beside a peer."""

@@ -1,0 +1,86 @@
+"""`moonteam bench train`: how fast this machine trains, and what share of its peak that is."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from moonteam import files
+from moonteam.errors import InputError
+from training.bench.measure import Wanted
+
+
+@dataclass(frozen=True)
+class Args:
+    """Training throughput: collection, update and both in env steps a second, compilation apart.
+
+    Times are the best of several repeats of one update from fresh parameters, spread over all
+    devices; on a CPU each core counts as one (JAX_NUM_CPU_DEVICES=1 goes back to one). The
+    share of peak counts matrix products only, against the fastest square product measured here.
+
+    With --jaxmarl the learner runs beside JaxMARL's published mappo_rnn_mpe loop instead: on its
+    env, with its numbers and networks of its shapes, in turns, each in a process of its own.
+
+    Examples:
+      moonteam bench train
+      moonteam bench train pi_5t --num-envs 256 --num-minibatches 4 --json
+      git clone https://github.com/FLAIROx/JaxMARL
+      moonteam bench train --jaxmarl JaxMARL --repeats 3
+    """
+
+    preset: tyro.conf.Positional[str] = "small"
+    """Shapes to train with: a preset of `moonteam train`."""
+    phase: str = "refinement"
+    """bootstrap or refinement."""
+    jaxmarl: Path | None = None
+    """A checkout of JaxMARL, whose loop is run beside ours instead of a preset."""
+    num_envs: int | None = None
+    """Environments, if not the preset's; beside JaxMARL 256 if not given."""
+    num_minibatches: int | None = None
+    """Minibatches, if not the preset's or JaxMARL's."""
+    precision: str | None = None
+    """float32, tf32 or bfloat16, if not the preset's."""
+    updates: int = 2
+    """Updates in one timed run beside JaxMARL."""
+    repeats: int = 5
+    """Timed repeats; the best counts."""
+    json: bool = False
+    """One JSON document on standard output."""
+    markdown: bool = False
+    """The table as Markdown and nothing else."""
+    out: Path | None = None
+    """Folder for bench_train.json."""
+
+    @property
+    def wanted(self) -> Wanted:
+        """What is measured."""
+        return Wanted(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Wanted)})
+
+
+def run(args: Args) -> int:
+    """Measures and prints; returns the exit code."""
+    from moonteam.report.tables import print_plain
+    from training.bench import ours, peer
+
+    if args.repeats < 1:
+        raise InputError("repeats", f"{args.repeats} is not allowed; at least 1")
+    if args.jaxmarl is None:
+        document = ours.measure(args.wanted, command(args))
+        tables = [ours.table(document)]
+    else:
+        document = peer.measure(args.wanted, args.jaxmarl, command(args))
+        tables = [peer.table(document)]
+    if args.out is not None:
+        files.write_json(args.out / "bench_train.json", document)
+    print_plain(args, document, tables)
+    return 0
+
+
+def command(args: Args) -> str:
+    """The words that measure this again."""
+    from moonteam.report import provenance
+
+    return provenance.command("bench train", args, ("json", "markdown", "out"), ("preset",))

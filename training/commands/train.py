@@ -1,0 +1,163 @@
+"""`moonteam train PRESET`."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from moonteam import files
+from training.run import config as configs
+from training.run.config import Config
+
+if TYPE_CHECKING:
+    from training.commands import imitate, refine
+    from training.run import compare
+
+IMITATION = ("quick", "any_team")
+"""Presets that imitate the exact planner; see `training.commands.imitate`."""
+REFINE = "refine"
+"""MAPPO from an imitated policy; see `training.commands.refine`."""
+COMPARE = "compare"
+"""Runs side by side; see `training.run.compare`."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's),
+    small and laptop (for two cores).
+
+    The presets quick and any_team imitate the exact planner instead, for teams of any size, and
+    refine goes on from there by MAPPO; they have options of their own: moonteam train quick --help.
+    compare puts runs side by side: moonteam train compare --help.
+
+    The first word after `train` is the preset; every number of it can be changed by an option.
+
+    Examples:
+      moonteam train small
+      moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50
+      moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50 --resume
+      moonteam train small --begin runs/small-0/checkpoints/00001000 --refinement.lr 1e-3
+      moonteam train pi_5t --dry-run --compiled
+    """
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """The run's numbers, from the preset."""
+    out: Path | None = None
+    """Run folder; runs/PRESET-SEED if not given."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    begin: Path | None = None
+    """A checkpoint of another run, RUN/checkpoints/NUMBER: a new run that goes on from there with
+    its own numbers. Network and environments must be as they were."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints; a chunk of updates is never cut."""
+    tensorboard: bool = False
+    """Write the metrics as TensorBoard events into the run folder too; needs
+    pip install 'moonteam[tensorboard]'."""
+    stop_on_collapse: bool = True
+    """Stop, with exit code 1, when held-out success has fallen to half of its best for three
+    evaluations in a row."""
+    coordinator: str = ""
+    """host:port of process 0, to train on several hosts; each runs this command."""
+    processes: int = 1
+    """Processes that train together."""
+    process: int = 0
+    """Number of this one, from 0; others than 0 write to OUT/process-N."""
+    dry_run: bool = False
+    """Print the numbers, totals, memory and work, train nothing."""
+    compiled: bool = False
+    """With --dry-run: also compile both phases, without running them, and print what memory XLA
+    sets aside for them."""
+    json: bool = False
+    """One JSON document on standard output: the report, or the dry run's table."""
+
+
+def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
+    """Arguments of the command; the preset's numbers are the defaults of all options.
+
+    Raises InputError for a preset that does not exist.
+    """
+    if words and words[0] in IMITATION:
+        from training.commands import imitate
+
+        return imitate.parse(words)
+    if words and words[0] == REFINE:
+        from training.commands import refine
+
+        return refine.parse(words[1:])
+    if words and words[0] == COMPARE:
+        from training.run import compare
+
+        return compare.parse(words[1:])
+    named = bool(words) and not words[0].startswith("-")
+    asks_help = any(word in ("-h", "--help") for word in words)
+    if not named and not asks_help:
+        configs.preset("" if not words else words[0])
+    name, rest = (words[0], words[1:]) if named else ("small", words)
+    default = Args(configs.preset(name))
+    return tyro.cli(Args, prog=f"moonteam train {name if named else 'PRESET'}", default=default,
+                    args=rest, description=inspect.getdoc(Args))
+
+
+def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
+    """Trains, describes or compares; returns the exit code."""
+    from moonteam.compilation import enable_cache
+
+    enable_cache()
+    if not isinstance(args, Args):
+        from training.commands import imitate, refine
+        from training.run import compare
+
+        if isinstance(args, compare.Args):
+            return compare.run(args)
+        return refine.run(args) if isinstance(args, refine.Args) else imitate.run(args)
+    if args.dry_run:
+        from training.run import account
+
+        table = account.describe(args.config, args.compiled)
+        print(files.dump_json(table, 2) if args.json else account.as_text(args.config, table))
+        return 0
+    return _train(args)
+
+
+def _train(args: Args) -> int:
+    from training import sharding
+    from training.run import loop, record
+
+    config = args.config
+    if args.tensorboard:
+        record.tensorboard_writer()  # its lack is said before anything is written
+    out = args.out or Path("runs") / f"{config.name}-{config.seed}"
+    sharding.use_all_cores()
+    if args.coordinator:
+        sharding.join(args.coordinator, args.processes, args.process)
+        out = out / f"process-{args.process}" if args.process else out
+    run = loop.Run(config, out, args.resume, args.checkpoint_seconds, args.stop_on_collapse,
+                   args.tensorboard, args.begin)
+    say = sys.stderr if args.json else sys.stdout
+    try:
+        with loop.stop_on_signals() as stop:
+            finished = run.train(stop)
+    except loop.Diverged as error:
+        print(f"moonteam: {error}", file=sys.stderr)
+        return 1
+    if not finished:
+        print(f"moonteam: interrupted after update {run.position.total_updates}, saved; go on "
+              f"with --out {out} --resume", file=sys.stderr)
+        return 130
+    report = run.finish()
+    if args.json:
+        print(files.dump_json(report | {"out": str(out), "config": dataclasses.asdict(config)}))
+    for decode in ("argmax", "sample"):
+        score = report[decode]
+        print(f"{decode}: success {score['success']:.3f}, makespan {score['makespan']:.2f}, moves "
+              f"{score['moves']:.2f} on {report['scenarios']} held-out scenarios", file=say)
+    print(f"{report['env_steps']:,} env steps in {report['seconds']:.0f} s; policy, curve and "
+          f"report in {out}", file=say)
+    return 0

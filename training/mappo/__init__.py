@@ -1,0 +1,1 @@
+"""Multi-agent PPO: tasks, rollout, advantage estimation, losses, update."""

@@ -1,0 +1,60 @@
+"""How well the current policy does on scenarios that training never draws.
+
+Legend: E scenarios, N agents.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from training.mappo.networks import Networks
+from training.mappo.rollout import choose
+from training.mappo.task import EnvState, Task
+
+HELD_OUT_SEED = 715517
+"""Keys of held-out scenarios descend from this seed, those of training from the run's."""
+
+
+class Score(NamedTuple):
+    """Over E scenarios; failures count with max_steps and their real moves."""
+
+    success: Array  # [] share solved within max_steps
+    makespan: Array  # [] mean steps
+    moves: Array  # [] mean team effort
+
+
+class _Walk(NamedTuple):
+    state: EnvState
+    memory: Array
+    solved: Array
+    steps: Array
+    moves: Array
+
+
+@partial(jax.jit, static_argnames=("networks", "task", "num_scenarios", "sample"))
+def score(networks: Networks, task: Task, actor: dict, key: Array, num_scenarios: int,
+          sample: bool) -> Score:
+    """Plays each scenario once: argmax of the logits, or a sampled action."""
+    begin_key, play_key = jax.random.split(key)
+    state = task.reset(begin_key, num_scenarios)
+    never = jnp.zeros((1, num_scenarios), bool)
+
+    def step(walk: _Walk, t: Array) -> tuple[_Walk, None]:
+        obs = task.observe(walk.state)[None]
+        memory, logits = networks.logits(actor, walk.memory, obs, never)
+        act_key, env_key = jax.random.split(jax.random.fold_in(play_key, t))
+        action = (jax.random.categorical(act_key, logits[0]) if sample
+                  else jnp.argmax(logits[0], axis=-1))
+        out = task.step(env_key, walk.state, action)
+        after = _Walk(out.state, memory, out.terminated, out.steps, out.moves)
+        return choose(walk.solved, walk, after), None
+
+    none = jnp.zeros(num_scenarios, jnp.int32)
+    walk = _Walk(state, networks.empty(num_scenarios).actor, never[0], none, none)
+    walk, _ = jax.lax.scan(step, walk, jnp.arange(task.max_steps))
+    return Score(walk.solved.mean(), walk.steps.mean(), walk.moves.mean())

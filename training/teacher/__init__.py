@@ -1,0 +1,1 @@
+"""Learning from the exact planner, and refining what was learned."""
