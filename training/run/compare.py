@@ -67,7 +67,7 @@ class Row(msgspec.Struct, frozen=True):
 
 
 class Final(msgspec.Struct, frozen=True):
-    """What is used of tables.json; of an unfinished run, its last evaluation."""
+    """What is used of report.json; of an unfinished run, its last evaluation."""
 
     env_steps: int
     seconds: float
@@ -134,7 +134,7 @@ def read(folder: Path) -> Trained:
     metrics = folder / "metrics.jsonl"
     rows = record.read(metrics)
     checked = files.convert(rows, list[Row], metrics)
-    ended = folder / "tables.json"
+    ended = folder / "report.json"
     if ended.exists():
         return Trained(folder, flat(config), rows, files.read_json(ended, Final), True)
     for row in reversed(checked):

@@ -80,7 +80,7 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for tables.json, summary.csv, rows.csv, table.md and gaps.png."""
+    """Folder for report.json, summary.csv, rows.csv, table.md and gaps.png."""
 
 
 def command_line(name: str, words: list[str], options: dict[str, object]) -> str:

@@ -41,7 +41,7 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for tables.json, table.md and preference.png."""
+    """Folder for report.json, table.md and preference.png."""
 
 
 def run(args: Args) -> int:
@@ -68,7 +68,7 @@ def run(args: Args) -> int:
     document = preference.evaluate(found, policy, how, wishes, args.seed, title, command)
     shown = [preference.pivot(document)]
     if args.out:
-        files.write_json(args.out / "tables.json", document)
+        files.write_json(args.out / "report.json", document)
         files.write_text(args.out / "table.md", tables.plain_markdown(document, shown) + "\n")
         figures.preference(args.out / "preference.png", document)
     tables.print_plain(args, document, shown)

@@ -44,7 +44,7 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for tables.json, summary.csv and table.md."""
+    """Folder for report.json, summary.csv and table.md."""
 
 
 def run(args: Args) -> int:

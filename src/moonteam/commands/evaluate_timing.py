@@ -44,7 +44,7 @@ class Args:
     markdown: bool = False
     """Print the table as Markdown and nothing else."""
     out: Path | None = None
-    """Folder for tables.json, timing.csv, table.md and timing.png."""
+    """Folder for report.json, timing.csv, table.md and timing.png."""
 
 
 def run(args: Args) -> int:
@@ -59,7 +59,7 @@ def run(args: Args) -> int:
 
     shown = [timing.pivot(document)]
     if args.out:
-        files.write_json(args.out / "tables.json", document)
+        files.write_json(args.out / "report.json", document)
         files.write_text(args.out / "timing.csv", tables.plain_csv(document["rows"]))
         files.write_text(args.out / "table.md", tables.plain_markdown(document, shown) + "\n")
         figures.timing(args.out / "timing.png", document)
