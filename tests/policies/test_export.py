@@ -98,7 +98,7 @@ def test_the_command_prints_the_difference(path, tmp_path, capsys):
     assert report["bytes"] == out.stat().st_size
     # Loaded where there is no JAX at all.
     code = ("import sys; sys.modules['jax'] = None\n"
-            "from moonteam.policies.onboard import inputs, choose\n"
+            "from moonteam.policies.export.onboard import inputs, choose\n"
             "import onnxruntime as ort\n"
             f"session = ort.InferenceSession({str(out)!r})\n"
             "x = inputs((9, 9), [[0, 0], [8, 8]], [1, 2], [[4, 4]], [3], [True], [False], 60)\n"

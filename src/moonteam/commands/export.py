@@ -22,7 +22,7 @@ class Args:
     """Write a policy as a self-contained ONNX file and hold it against the original.
 
     The file takes any number of robots and targets where the policy does; its metadata say
-    what the inputs are, and moonteam/policies/onboard.py builds them with NumPy alone. The
+    what the inputs are, and moonteam/policies/export/onboard.py builds them with NumPy alone. The
     largest difference from the original, on states that it visits, is printed. Needs the extra
     `export` (onnx, onnxruntime). Exit code 1 if the two differ.
 

@@ -345,7 +345,7 @@ def _model(g: _Graph, policy: PolicyFile, given: list, made: list) -> ModelProto
              "config": json.dumps(policy.config), "recipe": json.dumps(policy.recipe),
              "inputs": json.dumps({v.name: v.doc_string for v in given}),
              "actions": "up (+y), down (-y), left (-x), right (+x), stay",
-             "builder": "moonteam/policies/onboard.py (NumPy alone) builds the inputs"}
+             "builder": "moonteam/policies/export/onboard.py (NumPy alone) builds the inputs"}
     helper.set_model_props(model, about)
     checker.check_model(model, full_check=True)
     return model
