@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from moonteam import compilation, files
+from moonteam import compilation
+from moonteam.commands.options import Missions, Reported
 from moonteam.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,13 +15,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Missions, Reported):
     """Time random missions in physics, from the policy's decision to the last target.
 
     fused: decisions, waypoints, controllers and physics of all missions are one jitted program
     on MJX, for accelerators. native and mjx: the executor of `moonteam rollout`, step by step.
     Barrier mode, no events. The real-time factor adds up all missions, each until it was over.
     Compilation is timed apart. Run it on a quiet machine.
+
+    Files in --out: bench_execution.json and table.md.
 
     Examples:
       moonteam bench execution
@@ -38,26 +41,10 @@ class Args:
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
     site: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
     """Preset of the ground."""
-    site_seed: int = 0
-    """Seed of the ground."""
-    targets: int = 5
-    """Targets of each mission."""
-    side: int = 32
-    """Cells of a side of the map."""
     cell: float = 1.0
     """Metres a side of a cell."""
-    max_steps: int = 128
-    """Joint decisions after which a mission has failed."""
     seconds: float = 600.0
     """Mission seconds after which fused cuts a mission off."""
-    seed: int = 0
-    """Seed of the missions."""
-    json: bool = False
-    """Print one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for bench_execution.json."""
 
 
 def run(args: Args) -> int:
@@ -68,7 +55,7 @@ def run(args: Args) -> int:
         raise InputError("--seconds", f"{args.seconds:g} is not allowed; 1 to 36000")
     compilation.enable_cache()
     compilation.call_at_once()
-    from moonteam.report.tables import print_plain
+    from moonteam.report import tables
     from sim2grid.study import bench
     from sim2grid.study.fleet import Recipe, make_fleet
 
@@ -82,8 +69,8 @@ def run(args: Args) -> int:
                  for engine in dict.fromkeys(args.engine)]
     report = _document(args, rows)
     if args.out is not None:
-        files.write_json(args.out / "bench_execution.json", report)
-    print_plain(args, report, [table(report)])
+        tables.save_plain(args.out, "bench_execution", report, [table(report)])
+    tables.print_plain(args, report, [table(report)])
     return 0
 
 
@@ -110,16 +97,16 @@ def _decider(args: Args) -> tuple[Decider, Any]:
 
 def _document(args: Args, rows: list[dict[str, Any]]) -> dict[str, Any]:
     from moonteam.physics.trials.speed import device_name
-    from moonteam.report import provenance
+    from moonteam.report import command, provenance
 
-    command = provenance.command("bench execution", args, ("json", "markdown", "out"))
     notes = [
         f"Drone, legged and wheeled robot, {args.targets} targets, {args.side} x {args.side} cells "
         f"of {args.cell:g} m on {args.site}; decisions by {args.planner}"
         + (f" {Path(args.policy).stem}." if args.planner == "policy" else "."),
         "fused: one program on MJX for decisions, control and physics. native, mjx: step by step."]
     return {"title": "execution speed", "command": "bench execution", "device": device_name(),
-            "rows": rows, "notes": notes, "meta": provenance.meta(command, args.seed)}
+            "rows": rows, "notes": notes,
+            "meta": provenance.meta(command.line("bench execution", args), args.seed)}
 
 
 def table(document: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
+from moonteam.commands.options import Missions, Reported, Resumable
+from moonteam.report import command
+from moonteam.report.command import Aside
 from sim2grid.study import journal
 from sim2grid.study.journal import Journal
 
@@ -19,7 +22,7 @@ PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Missions, Resumable, Reported):
     """Execute random missions in physics and compare what they cost with the grid's promise.
 
     Each mission has a drone, a legged and a wheeled robot with random skills, random targets
@@ -43,8 +46,6 @@ class Args:
 
     site: tuple[Literal["mare", "highland", "crater_rim", "polar", "flat"], ...] = ("mare",)
     """Presets of the ground, one group of missions each."""
-    site_seed: int = 0
-    """Seed of the ground."""
     count: int = 20
     """Missions a site."""
     loop: tuple[Literal["closed", "open", "oracle", "grid"], ...] = ("closed",)
@@ -59,14 +60,8 @@ class Args:
     """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
     objective: Literal["makespan", "moves", "weighted"] = "makespan"
     """What the planner minimises (exact, greedy, and policy with best-of-K)."""
-    targets: int = 5
-    """Targets of each mission, before events."""
-    side: int = 32
-    """Cells of a side of the map."""
     cell: float = 1.0
     """Metres a side of a cell."""
-    max_steps: int = 128
-    """Joint decisions after which a mission has failed."""
     lose: float = 0.0
     """Chance for each mission that one robot is lost, at a random decision in mid-mission."""
     slow: float = 0.0
@@ -77,22 +72,12 @@ class Args:
     """New targets that appear in mid-mission, each at a random decision."""
     impassable: int = 0
     """Cells on the way of a robot on the ground that turn out closed to its kind."""
-    seed: int = 0
-    """Seed of the missions, their events and the planners."""
     backend: tuple[Literal["native", "mjx"], ...] = ("native",)
     """Physics engines: C MuJoCo, MJX for accelerators, or both beside each other."""
     width: int = 25
     """Worlds that the engine advances together."""
-    threads: int = 0
+    threads: Aside[int] = 0
     """CPU threads of the native engine, 0 for all; the report is the same."""
-    resume: bool = False
-    """Go on with the run in --out; the options must be the same."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the tables as Markdown and nothing else."""
-    out: Path | None = None
-    """Output folder."""
 
 
 def run(args: Args) -> int:
@@ -117,9 +102,9 @@ def run(args: Args) -> int:
     except KeyboardInterrupt:
         interrupted = True
     rows = evaluation.sorted_rows()
-    command = provenance.command("evaluate execution", args, _NOT_REPEATED)
     report = document(rows, evaluation.entries, evaluation.contenders, _options(args),
-                      provenance.meta(command, args.seed), args.seed)
+                      provenance.meta(command.line("evaluate execution", args), args.seed),
+                      args.seed)
     if interrupted:
         report["interrupted"] = True
     if args.out:
@@ -127,10 +112,6 @@ def run(args: Args) -> int:
     _print(args, report)
     _say(f"{len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
     return journal.interrupted(args.out) if interrupted else 0
-
-
-_NOT_REPEATED = ("json", "markdown", "out", "resume", "threads")
-"""Options on which the report does not depend."""
 
 
 def _check(args: Args) -> None:
@@ -158,10 +139,9 @@ def _evaluation(args: Args) -> Evaluation:
 
 def _options(args: Args) -> dict[str, Any]:
     """What the rows depend on; the same in a run and in what resumes it."""
-    left_out = (*_NOT_REPEATED, "lose", "slow", "silent", "new_targets", "impassable")
-    options = {key: value for key, value in asdict(args).items() if key not in left_out}
-    rates = {"lose": args.lose, "slow": args.slow, "silent": args.silent,
-             "new_targets": args.new_targets, "impassable": args.impassable}
+    options = command.figures(args)
+    rates = {name: options.pop(name)
+             for name in ("lose", "slow", "silent", "new_targets", "impassable")}
     return options | {"rates": rates}
 
 

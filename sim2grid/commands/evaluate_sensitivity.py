@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
 from moonteam import files
+from moonteam.commands.options import Missions, Reported, Resumable
+from moonteam.report import command
 from sim2grid.study import journal
 from sim2grid.study.journal import Journal
 
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Missions, Resumable, Reported):
     """Draw success and mission seconds against slope, boulders, friction, noise and delay.
 
     One quantity is varied at a time over random missions of one site, as in `moonteam evaluate
@@ -45,8 +47,6 @@ class Args:
     """What is varied."""
     site: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
     """Preset of the ground."""
-    site_seed: int = 0
-    """Seed of the ground."""
     count: int = 10
     """Missions for each value."""
     mode: tuple[Literal["barrier", "async"], ...] = ("async",)
@@ -57,26 +57,12 @@ class Args:
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
     decode: str = "argmax"
     """How actions are read from the policy: argmax, sample or best-of-K."""
-    targets: int = 5
-    """Targets of each mission."""
     side: int = 16
     """Cells of a side of the map, each a metre."""
-    max_steps: int = 128
-    """Joint decisions after which a mission has failed."""
-    seed: int = 0
-    """Seed of the missions and the planners."""
     backend: Literal["native", "mjx"] = "native"
     """Physics engine: C MuJoCo, or MJX for accelerators."""
     width: int = 25
     """Worlds that the engine advances together."""
-    resume: bool = False
-    """Go on with the run in --out; the options must be the same."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Output folder."""
 
 
 def run(args: Args) -> int:
@@ -121,10 +107,6 @@ def run(args: Args) -> int:
     return journal.interrupted(args.out) if interrupted else 0
 
 
-_NOT_REPEATED = ("json", "markdown", "out", "resume")
-"""Options on which the report does not depend."""
-
-
 def _check(args: Args) -> None:
     """Raises InputError for options out of range."""
     journal.check(args, (
@@ -142,7 +124,8 @@ class _Rows:
         self.found: dict[str, dict[tuple[str, int], Row]] = {}
         self._journal: Journal[tuple[str, Row]] | None = None
         if args.out:
-            self._journal = Journal(args.out, args.resume, _options(args), tuple[str, Row])
+            self._journal = Journal(args.out, args.resume, command.figures(args),
+                                    tuple[str, Row])
             for key, row in self._journal.entries:
                 self._put(key, row)
 
@@ -160,19 +143,12 @@ class _Rows:
             self._journal.add((key, row))
 
 
-def _options(args: Args) -> dict[str, Any]:
-    """What the rows depend on."""
-    return {key: value for key, value in asdict(args).items()
-            if key not in _NOT_REPEATED}
-
-
 def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: list[str],
               impossible: dict[str, str]) -> dict[str, Any]:
     """The report: a curve for each quantity and contender, and the rows behind them."""
     from moonteam.report import provenance
     from sim2grid.study.sensitivity import SWEEPS, point, settings
 
-    command = provenance.command("evaluate sensitivity", args, _NOT_REPEATED)
     curves = [
         {"quantity": quantity, "label": SWEEPS[quantity].label, "contender": name,
          "points": [{"value": s.value, "impossible": impossible.get(s.key)} | point(
@@ -180,7 +156,8 @@ def _document(args: Args, rows: dict[str, dict[tuple[str, int], Row]], names: li
              args.seed) for s in settings([quantity])]}
         for quantity in args.quantity for name in names]
     return {"kind": "sensitivity", "title": "sensitivity of executions",
-            "meta": provenance.meta(command, args.seed), "options": _options(args),
+            "meta": provenance.meta(command.line("evaluate sensitivity", args), args.seed),
+            "options": command.figures(args),
             "curves": curves, "notes": NOTES,
             "rows": [{"setting": key} | msgspec.to_builtins(row)
                      for key, found in rows.items() for _, row in sorted(found.items())]}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,9 +15,12 @@ import numpy.typing as npt
 import tyro
 
 from moonteam import __version__, files, paths
+from moonteam.commands.options import Printed
 from moonteam.errors import InputError
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import Mission
+from moonteam.report import command
+from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
     from moonteam.planners.base import Planner
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Printed):
     """Run a mission in physics: a video, a map of the paths and a report.
 
     The planner decides on the grid; every move becomes a waypoint that a simulated robot has to
@@ -71,14 +73,12 @@ class Args:
     """Number of the mission in --from."""
     contender: str | None = None
     """Whose run of it, a name in --from such as "closed exact barrier"; the first by default."""
-    out: Path | None = None
+    out: Aside[Path | None] = None
     """Output folder; runs/NAME by default."""
-    video: bool = True
+    video: Aside[bool] = True
     """Make the video."""
-    viewer: bool = False
+    viewer: Aside[bool] = False
     """Show the mission in a live 3-D window while it runs; needs a display."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
 
 
 FROM_REPORT = ("planner", "policy", "decode", "objective", "mode", "backend", "seed")
@@ -185,7 +185,7 @@ def _from_file(args: Args) -> Run:
     who = args.planner if args.planner != "policy" else f"policy {Path(args.policy).stem}"
     return Run(prepared, execution, prepared.scene.qpos0, plan, args.planner,
                None if args.planner == "policy" else args.objective, args.backend, args.seed,
-               f"{mission.name}: {who}", _command(args))
+               f"{mission.name}: {who}", command.line("rollout", args))
 
 
 def _from_report(args: Args) -> Run:
@@ -196,19 +196,11 @@ def _from_report(args: Args) -> Run:
     assert args.number is not None
     staged = restage(load_report(args.report), args.number, args.report, args.contender)
     row, contender = staged.row, staged.contender
-    words = ["moonteam", "rollout", "--from", str(args.report), "--mission", str(row.number),
-             "--contender", contender.name]
+    command_line = command.line("rollout", replace(args, contender=contender.name))
     return Run(staged.prepared, staged.execution, staged.prepared.scene.qpos0, staged.grid_plan,
                row.report.planner, row.report.objective, contender.backend, row.seed,
-               f"mission {row.number}, {row.site}: {contender.name}", shlex.join(words),
+               f"mission {row.number}, {row.site}: {contender.name}", command_line,
                staged.width, row.slot, row.report)
-
-
-def _command(args: Args) -> str:
-    """The command line of these options, but where it writes to."""
-    from moonteam.report.provenance import command
-
-    return command("rollout", args, ("out", "json", "viewer", "video"), ("mission",))
 
 
 def _load(name: str) -> Mission:

@@ -11,7 +11,7 @@ import msgspec
 
 from moonteam import __version__, files
 from moonteam.errors import InputError
-from moonteam.report.provenance import flag
+from moonteam.report.command import flag
 
 Entry = TypeVar("Entry")
 

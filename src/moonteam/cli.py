@@ -8,8 +8,8 @@ Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 inte
 from __future__ import annotations
 
 import importlib
-import inspect
 import sys
+from typing import Any
 
 from moonteam import __version__
 from moonteam.errors import InputError
@@ -67,6 +67,16 @@ def find_command(words: list[str]) -> tuple[str, list[str]]:
                      + ", ".join(group or COMMANDS))
 
 
+def parse(name: str, words: list[str]) -> Any:
+    """The arguments of the command `name`, read from the words after it. Raises InputError."""
+    module = importlib.import_module(COMMANDS[name][0])
+    if hasattr(module, "parse"):  # a command whose first word decides its defaults
+        return module.parse(words)
+    from moonteam.commands import options
+
+    return options.parse(module.Args, name, words)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
@@ -79,14 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         name, rest = find_command(words)
         module = importlib.import_module(COMMANDS[name][0])
-        import tyro
-
-        if hasattr(module, "parse"):  # a command whose first word decides its defaults
-            return module.run(module.parse(rest))
-        args = tyro.cli(module.Args, prog=f"moonteam {name}", args=rest,
-                        description=inspect.getdoc(module.Args),
-                        config=(tyro.conf.FlagCreatePairsOff,))
-        return module.run(args)
+        return module.run(parse(name, rest))
     except InputError as error:
         print(f"moonteam: {error}", file=sys.stderr)
         return 2

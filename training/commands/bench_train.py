@@ -8,13 +8,13 @@ from pathlib import Path
 
 import tyro
 
-from moonteam import files
+from moonteam.commands.options import Reported
 from moonteam.errors import InputError
 from training.bench.measure import Wanted
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Reported):
     """Training throughput: collection, update and both in env steps a second, compilation apart.
 
     Times are the best of several repeats of one update from fresh parameters, spread over all
@@ -23,6 +23,8 @@ class Args:
 
     With --jaxmarl the learner runs beside JaxMARL's published mappo_rnn_mpe loop instead: on its
     env, with its numbers and networks of its shapes, in turns, each in a process of its own.
+
+    Files in --out: bench_train.json and table.md.
 
     Examples:
       moonteam bench train
@@ -47,13 +49,6 @@ class Args:
     """Updates in one timed run beside JaxMARL."""
     repeats: int = 5
     """Timed repeats; the best counts."""
-    json: bool = False
-    """One JSON document on standard output."""
-    markdown: bool = False
-    """The table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for bench_train.json."""
-
     @property
     def wanted(self) -> Wanted:
         """What is measured."""
@@ -62,25 +57,19 @@ class Args:
 
 def run(args: Args) -> int:
     """Measures and prints; returns the exit code."""
-    from moonteam.report.tables import print_plain
+    from moonteam.report import command, tables
     from training.bench import ours, peer
 
     if args.repeats < 1:
         raise InputError("repeats", f"{args.repeats} is not allowed; at least 1")
+    made_by = command.line("bench train", args)
     if args.jaxmarl is None:
-        document = ours.measure(args.wanted, command(args))
-        tables = [ours.table(document)]
+        document = ours.measure(args.wanted, made_by)
+        shown = [ours.table(document)]
     else:
-        document = peer.measure(args.wanted, args.jaxmarl, command(args))
-        tables = [peer.table(document)]
+        document = peer.measure(args.wanted, args.jaxmarl, made_by)
+        shown = [peer.table(document)]
     if args.out is not None:
-        files.write_json(args.out / "bench_train.json", document)
-    print_plain(args, document, tables)
+        tables.save_plain(args.out, "bench_train", document, shown)
+    tables.print_plain(args, document, shown)
     return 0
-
-
-def command(args: Args) -> str:
-    """The words that measure this again."""
-    from moonteam.report import provenance
-
-    return provenance.command("bench train", args, ("json", "markdown", "out"), ("preset",))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,8 @@ from typing import Any, Literal
 import tyro
 
 from moonteam import files, paths
+from moonteam.commands.options import Printed, RunFolder, Seeded
+from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.planners.learned import EntityBrain, Policy
 from moonteam.policies.entity import EntitySpec
@@ -44,7 +45,7 @@ PRESETS = {
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, RunFolder, Printed):
     """Train the policy for any team by imitating the exact planner: quick or any_team.
 
     Examples:
@@ -56,8 +57,6 @@ class Args:
 
     preset: tyro.conf.Positional[Literal["quick", "any_team"]]
     """quick: 3 robots, 5 to 7 targets, 32 x 32; any_team: teams, maps and ground of all sizes."""
-    seed: int = 0
-    """Seed of everything random in the run."""
     rounds: int | None = None
     """Rounds of visiting, labelling and learning; the preset's number if not given."""
     begin: str = ""
@@ -65,18 +64,11 @@ class Args:
     instead of fresh weights."""
     lr: float | None = None
     """Learning rate after warm-up; the preset's number if not given."""
-    out: Path | None = None
-    """Run folder; runs/PRESET-SEED if not given."""
-    resume: bool = False
-    """Go on with the run in the folder."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
 
 
 def parse(words: list[str]) -> Args:
     """Arguments of `moonteam train quick|any_team`."""
-    return tyro.cli(Args, prog="moonteam train", args=words, description=inspect.getdoc(Args),
-                    config=(tyro.conf.FlagCreatePairsOff,))
+    return parse_words(Args, "train", words)
 
 
 def run(args: Args) -> int:

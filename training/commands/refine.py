@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,6 +9,8 @@ from typing import Literal
 import msgspec
 import tyro
 
+from moonteam.commands.options import Printed, RunFolder, Seeded
+from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.progress import say
 from training.commands.imitate import PRESETS, complete, entity_policy
@@ -18,7 +19,7 @@ from training.teacher.refinement import Refinement, Refiner
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, RunFolder, Printed):
     """Refine an imitated policy by MAPPO, with a centralised critic over the same tokens.
 
     Examples:
@@ -40,22 +41,13 @@ class Args:
     """Learning rate at the start."""
     leash: float = 0.1
     """Weight of the imitation loss beside the policy's."""
-    seed: int = 0
-    """Seed of everything random in the run."""
-    out: Path | None = None
-    """Run folder; runs/refine-SEED if not given."""
-    resume: bool = False
-    """Go on with the run in the folder."""
     beside: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
     """Folder of another refinement to draw beside this one in beside.png; again for more."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
 
 
 def parse(words: list[str]) -> Args:
     """Arguments of `moonteam train refine`."""
-    return tyro.cli(Args, prog="moonteam train refine", args=words,
-                    description=inspect.getdoc(Args), config=(tyro.conf.FlagCreatePairsOff,))
+    return parse_words(Args, "train refine", words)
 
 
 def run(args: Args) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from moonteam import files
+from moonteam.commands.options import Printed, RunFolder
+from moonteam.commands.options import parse as parse_words
+from moonteam.report.command import Aside
 from training.run import config as configs
 from training.run.config import Config
 
@@ -28,7 +30,7 @@ COMPARE = "compare"
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(RunFolder, Printed):
     """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's),
     small and laptop (for two cores).
 
@@ -48,16 +50,12 @@ class Args:
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     """The run's numbers, from the preset."""
-    out: Path | None = None
-    """Run folder; runs/PRESET-SEED if not given."""
-    resume: bool = False
-    """Go on with the run in the folder."""
     begin: Path | None = None
     """A checkpoint of another run, RUN/checkpoints/NUMBER: a new run that goes on from there with
     its own numbers. Network and environments must be as they were."""
-    checkpoint_seconds: float = 30.0
+    checkpoint_seconds: Aside[float] = 30.0
     """Seconds between two checkpoints; a chunk of updates is never cut."""
-    tensorboard: bool = False
+    tensorboard: Aside[bool] = False
     """Write the metrics as TensorBoard events into the run folder too; needs
     pip install 'moonteam[tensorboard]'."""
     stop_on_collapse: bool = True
@@ -69,13 +67,11 @@ class Args:
     """Processes that train together."""
     process: int = 0
     """Number of this one, from 0; others than 0 write to OUT/process-N."""
-    dry_run: bool = False
+    dry_run: Aside[bool] = False
     """Print the numbers, totals, memory and work, train nothing."""
-    compiled: bool = False
+    compiled: Aside[bool] = False
     """With --dry-run: also compile both phases, without running them, and print what memory XLA
     sets aside for them."""
-    json: bool = False
-    """One JSON document on standard output: the report, or the dry run's table."""
 
 
 def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
@@ -101,8 +97,7 @@ def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
         configs.preset("" if not words else words[0])
     name, rest = (words[0], words[1:]) if named else ("small", words)
     default = Args(configs.preset(name))
-    return tyro.cli(Args, prog=f"moonteam train {name if named else 'PRESET'}", default=default,
-                    args=rest, description=inspect.getdoc(Args))
+    return parse_words(Args, f"train {name if named else 'PRESET'}", rest, default)
 
 
 def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:

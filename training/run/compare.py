@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,8 @@ import msgspec
 import tyro
 
 from moonteam import files
+from moonteam.commands.options import Reported
+from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from training.run import record
 
@@ -20,12 +20,14 @@ DECODES = ("argmax", "sample")
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Reported):
     """Put run folders of `moonteam train` (presets small, laptop and pi_*) side by side.
 
     Runs that differ only in their seed are one row: the mean over seeds, in brackets the lowest
     and the highest. A row is named by what its numbers differ in from the first of its preset,
     so give the baseline first.
+
+    Files in --out: compare.json, table.md and curves.png.
 
     Examples:
       moonteam train compare runs/small-*
@@ -37,12 +39,6 @@ class Args:
     """Run folders, finished or not."""
     label: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Name of the first row; again for the second, and so on; all or none."""
-    json: bool = False
-    """Print one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for compare.json, table.md and curves.png."""
 
 
 class Score(msgspec.Struct, frozen=True):
@@ -96,26 +92,23 @@ class Trained:
 
 def parse(words: list[str]) -> Args:
     """Arguments of `moonteam train compare`."""
-    return tyro.cli(Args, prog="moonteam train compare", args=words,
-                    description=inspect.getdoc(Args), config=(tyro.conf.FlagCreatePairsOff,))
+    return parse_words(Args, "train compare", words)
 
 
 def run(args: Args) -> int:
     """Reads, prints, saves; returns the exit code."""
-    from moonteam.report import provenance, tables
+    from moonteam.report import command, provenance, tables
 
     if not args.runs:
         raise InputError("RUN", "no run folder is given; at least one is needed")
     groups = grouped([read(folder) for folder in args.runs], args.label)
-    labels = [word for name in args.label for word in ("--label", name)]
-    command = shlex.join(["moonteam", "train", "compare", *map(str, args.runs), *labels])
     seeds = sorted({run.seed for runs in groups.values() for run in runs})
     document = {
         "title": "training runs", "rows_are": "run",
         "summary": [summary(name, runs) for name, runs in groups.items()],
         "rows": [_plain(name, run) for name, runs in groups.items() for run in runs],
         "notes": notes(groups),
-        "meta": provenance.meta(command, 0) | {"seed": _listed(seeds)}}
+        "meta": provenance.meta(command.line("train compare", args), 0) | {"seed": _listed(seeds)}}
     if args.out:
         files.write_json(args.out / "compare.json", document)
         files.write_text(args.out / "table.md", tables.markdown(document, columns()) + "\n")

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from moonteam import compilation, files
-from moonteam.commands.evaluate_grid import Many, command_line
+from moonteam import compilation
+from moonteam.commands.options import Many, Reported, Seeded
 from moonteam.errors import InputError
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, Reported):
     """Measure the exact planner's median on one core, and environment steps per second.
 
     The environment is stepped beside JaxMARL's MPE_simple_spread_v3 (if jaxmarl is installed)
     with as many environments and agents, in one interleaved run. Run it on a quiet machine.
+
+    Files in --out: bench.json and table.md.
 
     Examples:
       moonteam bench grid
@@ -38,14 +39,6 @@ class Args:
     """Steps of one run."""
     repeats: int = 10
     """Runs of each environment, interleaved."""
-    seed: int = 0
-    """Seed of scenarios and actions."""
-    json: bool = False
-    """Print one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the tables as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for bench.json and table.md."""
 
 
 def check(args: Args) -> None:
@@ -83,13 +76,8 @@ def run(args: Args) -> int:
     check(args)
     compilation.enable_cache()
     from moonteam.evaluation.speed import env_speed, planner_speed
-    from moonteam.report import provenance, tables
+    from moonteam.report import command, provenance, tables
 
-    command = command_line("bench grid", [], {
-        "targets": args.targets, **{
-            name.replace("_", "-"): getattr(args, name) for name in (
-                "count", "budget", "envs", "agents", "env_targets", "steps", "repeats", "seed")
-            if getattr(args, name) != Args.__dataclass_fields__[name].default}})
     load = env_speed.Load(args.envs, args.agents, args.steps, args.repeats, args.seed)
     planner = planner_speed.measure(args.targets or (5, 6, 7, 8, 9, 10), args.count, args.budget,
                                     args.seed)
@@ -102,10 +90,8 @@ def run(args: Args) -> int:
              f"{args.repeats} runs each, interleaved; ours with {args.env_targets} targets, "
              f"observation, all six rewards and renewal of ended episodes; {beside}."]
     document = {"title": "grid speed", "planner": planner, "env": steps, "notes": notes,
-                "meta": provenance.meta(command, args.seed)}
+                "meta": provenance.meta(command.line("bench grid", args), args.seed)}
     if args.out:
-        files.write_json(args.out / "bench.json", document)
-        text = tables.plain_markdown(document, as_tables(document))
-        files.write_text(args.out / "table.md", text + "\n")
+        tables.save_plain(args.out, "bench", document, as_tables(document))
     tables.print_plain(args, document, as_tables(document))
     return 0

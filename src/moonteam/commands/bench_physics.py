@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from moonteam import compilation, files
+from moonteam import compilation
+from moonteam.commands.options import Reported
 from moonteam.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,13 +16,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Reported):
     """Steps a second and real-time factor of the three-robot scene on both backends.
 
     Every pair of a backend and a number of worlds is one row. steps_per_s counts the steps of
     all worlds, controllers included, physics_steps_per_s without them; the real-time factor
     adds up all worlds. With --compilation the time to compile is taken in fresh processes too,
     without and with the cache. Run it on a quiet machine.
+
+    Files in --out: bench_physics.json and table.md.
 
     Examples:
       moonteam bench physics
@@ -55,14 +57,6 @@ class Args:
     compilation: bool = False
     """time the compilation for one world in fresh processes, cold and from the cache"""
 
-    json: bool = False
-    """print one JSON document and nothing else"""
-
-    markdown: bool = False
-    """print the tables as Markdown and nothing else"""
-
-    out: Path | None = None
-    """folder for bench_physics.json"""
 
 
 def run(args: Args) -> int:
@@ -76,6 +70,7 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     compilation.call_at_once()
     from moonteam.physics.trials import speed
+    from moonteam.report.tables import plain_markdown, print_as, save_plain
 
     scene = speed.three_robots(args.site, args.seed, args.samples)
     rows = []
@@ -88,17 +83,9 @@ def run(args: Args) -> int:
                 for name in dict.fromkeys(args.backend)] if args.compilation else []
     report = _document(args, scene, rows, compiled)
     if args.out is not None:
-        files.write_json(args.out / "bench_physics.json", report)
-    if args.json:
-        print(files.dump_json(report))
-    elif args.markdown:
-        from moonteam.report.tables import plain_markdown
-
-        print(plain_markdown(report, tables(report)))
-    else:
-        for row in compiled:
-            print(f"{row['backend']}, {row['worlds']} worlds: compiled in {row['cold_s']:.1f} s, "
-                  f"from the cache in {row['cached_s']:.1f} s")
+        save_plain(args.out, "bench_physics", report, tables(report))
+    print_as(args, report, lambda: plain_markdown(report, tables(report)),
+             lambda: _show_compiled(compiled))
     return 0
 
 
@@ -113,16 +100,9 @@ def _loads(args: Args) -> Iterator[tuple[str, int, int]]:
 
 def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) -> dict[str, Any]:
     from moonteam.physics.trials import speed
-    from moonteam.report import provenance
+    from moonteam.report import command, provenance
     from moonteam.robots.base import CONTROL_PERIOD
 
-    default, words = Args(), ["moonteam", "bench", "physics"]
-    for name in ("backend", "worlds", "threads", "site", "samples", "seconds", "seed"):
-        value = getattr(args, name)
-        if value != getattr(default, name):
-            several = value if isinstance(value, tuple) else (value,)
-            words += [f"--{name}", *(str(one) for one in several)]
-    command = " ".join([*words, "--compilation"] if args.compilation else words)
     model, sites = scene.model, scene.site
     notes = [
         f"Three robots (nv {model.nv}) driving on {args.site}, {args.samples} x {args.samples} "
@@ -136,7 +116,8 @@ def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) 
         "cpus": len(os.sched_getaffinity(0)), "site": args.site, "seed": args.seed,
         "samples": args.samples, "nv": model.nv, "dt": model.opt.timestep,
         "seconds": args.seconds, "boulders": len(sites.boulders), "rows": rows,
-        "compilation": compiled, "notes": notes, "meta": provenance.meta(command, args.seed)}
+        "compilation": compiled, "notes": notes,
+        "meta": provenance.meta(command.line("bench physics", args), args.seed)}
 
 
 def tables(document: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
@@ -154,6 +135,12 @@ def tables(document: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
                     [[row["backend"], f"{row['cold_s']:.1f} s", f"{row['cached_s']:.1f} s"]
                      for row in document["compilation"]]))
     return out
+
+
+def _show_compiled(compiled: list[dict[str, Any]]) -> None:
+    for row in compiled:
+        print(f"{row['backend']}, {row['worlds']} worlds: compiled in {row['cold_s']:.1f} s, "
+              f"from the cache in {row['cached_s']:.1f} s")
 
 
 def _show(row: dict[str, Any]) -> None:

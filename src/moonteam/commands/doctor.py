@@ -10,6 +10,7 @@ import sys
 from dataclasses import dataclass
 
 from moonteam import compilation, files, paths
+from moonteam.commands.options import Printed
 
 PACKAGES = ("jax", "flax", "mujoco", "mujoco-mjx", "terraingenpy", "numba", "ortools")
 
@@ -29,7 +30,7 @@ os._exit(0)
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Printed):
     """Say what this machine can do: JAX devices, headless rendering, video, extras.
 
     Examples:
@@ -37,8 +38,6 @@ class Args:
       moonteam doctor --json
     """
 
-    json: bool = False
-    """Print one JSON document and nothing else."""
 
 
 def versions() -> dict[str, str | None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +10,14 @@ from typing import Any
 import tyro
 
 from moonteam import compilation, paths
+from moonteam.commands.options import Drawn, Limited, Many, Reported
 from moonteam.errors import InputError
 from moonteam.problem import scenario
 from moonteam.problem.scenario import Scenario
 
-Many = tyro.conf.UseAppendAction
-
 
 @dataclass(frozen=True)
-class Args:
+class Args(Drawn, Limited, Reported):
     """Play a set of scenarios with any number of planners and compare them with the optimum.
 
     One row a planner and objective, or a policy and decoding: success, slack metrics and
@@ -27,6 +25,8 @@ class Args:
     Every plan is played in the grid environment; what it says counts, not the planner's
     promise. Failures count with T = max_steps and the moves they made. Options marked "again"
     may be given several times.
+
+    Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png.
 
     Examples:
       moonteam evaluate grid 3x5 --planner exact --planner greedy --limit 200
@@ -61,35 +61,6 @@ class Args:
     time_limit: Many[tuple[float, ...]] = ()
     """Seconds a scenario that anytime planners (exact, lns, cpsat) may take; again for
     more rows. Default: theirs."""
-    seed: int = 0
-    """Seed of the scenarios drawn, of sampling and of the bootstrap."""
-    limit: int | None = None
-    """Only the first so many scenarios of the set."""
-    count: int = 200
-    """Without SET: scenarios to draw."""
-    agents: int = 3
-    """Without SET: agents of each scenario drawn."""
-    targets: int = 5
-    """Without SET: targets of each scenario drawn."""
-    side: int = 32
-    """Without SET: cells of a side of the map."""
-    max_steps: int = 128
-    """Without SET: steps in which a scenario must be solved."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for report.json, summary.csv, rows.csv, table.md and gaps.png."""
-
-
-def command_line(name: str, words: list[str], options: dict[str, object]) -> str:
-    """The command that makes this report again; options at their default are left out."""
-    for key, value in options.items():
-        for one in value if isinstance(value, tuple) else (value,):
-            if one is not None:
-                words += [f"--{key}", str(one)]
-    return shlex.join(["moonteam", *name.split(), *words])
 
 
 def load_set(name: str, limit: int | None) -> list[Scenario]:
@@ -99,13 +70,6 @@ def load_set(name: str, limit: int | None) -> list[Scenario]:
     suffix = ".json" if name.endswith(".json") else ".jsonl"
     found = scenario.load_set(paths.find(name, "testsets", suffix))
     return found[:limit]
-
-
-def drawn(args: Any) -> dict[str, object]:
-    """The options of a draw that the command line must repeat; `args` has them as fields."""
-    names = ("count", "agents", "targets", "side", "max_steps")
-    return {name.replace("_", "-"): getattr(args, name) for name in names
-            if name == "count" or getattr(args, name) != args.__dataclass_fields__[name].default}
 
 
 def _scenarios(args: Args) -> tuple[list[Scenario], str]:
@@ -133,18 +97,6 @@ def options_of(args: Any) -> Any:
         time_limits=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False))
 
 
-def repeated(args: Any, name: str, more: dict[str, object]) -> str:
-    """The command line of a report, from the same options and `more`."""
-    changed = {key: value for key in ("alpha", "beta") if key in args.__dataclass_fields__
-               and (value := getattr(args, key)) != args.__dataclass_fields__[key].default}
-    return command_line(name, [args.set] if args.set else [], {
-        **({} if args.set else drawn(args)), "planner": args.planner or ("exact",),
-        "objective": args.objective, "policy": args.policy, "preference": args.preference,
-        "decode": args.decode, **changed, **more, "time-limit": args.time_limit,
-        "seed": args.seed or None, "limit": args.limit}) + (
-            " --alone" if getattr(args, "alone", False) else "")
-
-
 def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
     """Saves and prints a report as the options wish; returns the exit code.
 
@@ -170,8 +122,10 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import grid
     from moonteam.evaluation.contenders import contenders
+    from moonteam.report import command
 
     found, title = _scenarios(args)
     rows = contenders(options_of(args))
-    document = grid.evaluate(found, rows, args.seed, title, repeated(args, "evaluate grid", {}))
+    document = grid.evaluate(found, rows, args.seed, title,
+                             command.line("evaluate grid", args))
     return deliver(args, document, grid, "gaps.png")

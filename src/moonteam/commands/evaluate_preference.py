@@ -7,17 +7,20 @@ from pathlib import Path
 
 import tyro
 
-from moonteam import compilation, files, paths
-from moonteam.commands.evaluate_grid import command_line, load_set
+from moonteam import compilation, paths
+from moonteam.commands.evaluate_grid import load_set
+from moonteam.commands.options import Limited, Reported, Seeded
 from moonteam.errors import InputError
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, Limited, Reported):
     """Sweep a policy's preference from 0 (time) to 1 (effort): mean makespan against mean moves.
 
     Beside it stand the exact planner's points for the same weights, certified optimal plans of
     the same scenarios (up to 12 targets).
+
+    Files in --out: report.json, table.md and preference.png.
 
     Examples:
       moonteam evaluate preference 3x7 --policy any_team --limit 200 --out runs/preference
@@ -32,16 +35,6 @@ class Args:
     """As in `evaluate grid`; best-of-K keeps what the preference asks for."""
     points: int = 11
     """Preferences, evenly from 0 to 1."""
-    seed: int = 0
-    """Seed of sampling and of the bootstrap."""
-    limit: int | None = None
-    """Only the first so many scenarios of the set."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for report.json, table.md and preference.png."""
 
 
 def run(args: Args) -> int:
@@ -52,24 +45,20 @@ def run(args: Args) -> int:
     from moonteam.evaluation import figures, preference
     from moonteam.planners import decode
     from moonteam.planners.learned import EntityBrain, Policy
-    from moonteam.report import tables
+    from moonteam.report import command, tables
 
     how = decode.parse(args.decode)
     found = load_set(args.set, args.limit)
     policy = Policy.load(paths.find(args.policy, "policies", ".safetensors"))
     if not isinstance(policy.brain, EntityBrain):
         raise InputError(policy.path, "takes no preference: its network is not of kind entity")
-    command = command_line("evaluate preference", [args.set], {
-        "policy": args.policy, "decode": args.decode if args.decode != "argmax" else None,
-        "points": args.points if args.points != 11 else None, "seed": args.seed or None,
-        "limit": args.limit})
     wishes = [round(i / (args.points - 1), 6) for i in range(args.points)]
     title = f"{Path(args.set).stem}: {len(found)} scenarios, preference from time to effort"
-    document = preference.evaluate(found, policy, how, wishes, args.seed, title, command)
+    document = preference.evaluate(found, policy, how, wishes, args.seed, title,
+                                   command.line("evaluate preference", args))
     shown = [preference.pivot(document)]
     if args.out:
-        files.write_json(args.out / "report.json", document)
-        files.write_text(args.out / "table.md", tables.plain_markdown(document, shown) + "\n")
+        tables.save_plain(args.out, "report", document, shown)
         figures.preference(args.out / "preference.png", document)
     tables.print_plain(args, document, shown)
     return 0

@@ -8,19 +8,22 @@ from pathlib import Path
 import tyro
 
 from moonteam import compilation
-from moonteam.commands.evaluate_grid import Many, deliver, load_set, options_of, repeated
+from moonteam.commands.evaluate_grid import deliver, load_set, options_of
+from moonteam.commands.options import Drawn, Limited, Many, Reported
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Drawn, Limited, Reported):
     """The paper's 5 + 5 experiment: each of the first five targets solved makes way for another.
 
     SET holds scenarios of ten targets, the last five of which appear later; without SET,
     --count scenarios are drawn from --seed (3 agents, 32 x 32). All planners meet the same new
     targets in the same order. The exact planner, which plans anew whenever a target appears,
     is always there to compare with. Options marked "again" may be given several times.
+
+    Files in --out: report.json, summary.csv, rows.csv, table.md and replanning.png.
 
     Examples:
       moonteam evaluate replanning --count 200
@@ -42,30 +45,10 @@ class Args:
     """argmax, plain-argmax (without the deadlock watch) or sample, with @T as in `evaluate grid`;
     again for more rows. Default: argmax."""
     new: int = 5
-    """How many of a scenario's targets appear later."""
-    count: int = 200
-    """Without SET: scenarios to draw."""
-    agents: int = 3
-    """Without SET: agents of each scenario drawn."""
-    targets: int = 5
-    """Without SET: targets of each scenario drawn, --new more appear later."""
-    side: int = 32
-    """Without SET: cells of a side of the map."""
-    max_steps: int = 128
-    """Without SET: steps in which a scenario must be solved."""
-    seed: int = 0
-    """Seed of the scenarios drawn, of sampling and of the bootstrap."""
+    """How many of a scenario's targets appear later; without SET, that many more than --targets."""
     time_limit: Many[tuple[float, ...]] = ()
     """Seconds a plan that anytime planners (exact, lns, cpsat) may take; again for
     more rows. Default: theirs."""
-    limit: int | None = None
-    """Only the first so many scenarios of the set."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for report.json, summary.csv, rows.csv, table.md and replanning.png."""
 
 
 def _scenarios(args: Args) -> tuple[list[Scenario], str]:
@@ -88,13 +71,13 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import replanning
     from moonteam.evaluation.contenders import contenders
+    from moonteam.report import command
 
     if any(text.startswith("best-of") for text in args.decode):
         raise InputError("--decode", "best-of-K looks ahead, which nobody can where targets "
                          "appear unannounced; argmax or sample")
     found, title = _scenarios(args)
     rows = contenders(options_of(args))
-    new = args.new if args.new != 5 else None
     document = replanning.evaluate(found, rows, args.new, args.seed, title,
-                                   repeated(args, "evaluate replanning", {"new": new}))
+                                   command.line("evaluate replanning", args))
     return deliver(args, document, replanning, "replanning.png")

@@ -11,17 +11,18 @@ import msgspec
 import tyro
 
 from moonteam import compilation, paths
-
-Many = tyro.conf.UseAppendAction
+from moonteam.commands.options import Limited, Many, Reported, Seeded
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, Limited, Reported):
     """Play the bundled scenario sets with a policy, whatever their teams and targets.
 
     Columns: decided step by step (argmax with the deadlock watch) at preference 0 and at
     preference 1, and the best of K sampled rollouts at preference 0. Gaps are mean makespan and
     mean moves over the mean optimum, or over the best known values where optima are not proved.
+
+    Files in --out: report.json, summary.csv, rows.csv and table.md.
 
     Examples:
       moonteam evaluate sets --policy any_team
@@ -35,22 +36,12 @@ class Args:
     any_team."""
     best_of: int = 16
     """K, sampled rollouts a scenario."""
-    limit: int | None = None
-    """Only the first so many scenarios of each set."""
-    seed: int = 0
-    """Seed of sampling and of the bootstrap."""
-    json: bool = False
-    """Print the report as one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for report.json, summary.csv and table.md."""
 
 
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the policy achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.report import provenance, tables
+    from moonteam.report import command, provenance, tables
 
     found = [paths.find(name, "policies", ".safetensors") for name in args.policy or ("any_team",)]
     rows, left = [], [(name, path) for name in args.sets or _bundled() for path in found]
@@ -61,15 +52,13 @@ def run(args: Args) -> int:
     except KeyboardInterrupt:
         lacking = ", ".join(name for name, _ in left)
         print(f"moonteam: interrupted; the report lacks {lacking}", file=sys.stderr)
-    words = [*args.sets, *(word for name in args.policy for word in ("--policy", name))]
-    words += ["--limit", str(args.limit)] if args.limit else []
     document = {
         "title": "policies on sets", "summary": rows, "rows": [], "rows_are": "set",
         "notes": [f"argmax: with the deadlock watch; best-of-{args.best_of}: planning time is the "
                   "whole set's, played in batches, over its scenarios.",
                   "5x20 and 8x40 are held against the best known plans, the others against "
                   "certified optima. In brackets: 95 % bootstrap intervals."],
-        "meta": provenance.meta(" ".join(["moonteam evaluate sets", *words]), args.seed)}
+        "meta": provenance.meta(command.line("evaluate sets", args), args.seed)}
     columns = _columns(args.best_of)
     if args.out:
         tables.save(args.out, document, columns)

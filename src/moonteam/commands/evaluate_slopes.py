@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
+from moonteam.commands.options import Reported
 from moonteam.errors import InputError
-from moonteam.files import dump_json, write_json
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Reported):
     """Straight drives up, down and across planes of a known slope, smooth and rough.
 
     Each drive is 13 m, 8 of them on the plane. A rover refuses a slope by standing still
     before it, which counts as stuck. Means are over drives that arrived.
+
+    Files in --out: slopes.json and table.md.
 
     Examples:
       moonteam evaluate slopes --kind legged
@@ -37,15 +38,6 @@ class Args:
     seed: int = 0
     """of the relief and of the drives' places"""
 
-    json: bool = False
-    """print one JSON document and nothing else"""
-
-    markdown: bool = False
-    """print the table for a page of docs, with command, commit and machine"""
-
-    out: Path | None = None
-    """folder for slopes.json"""
-
 
 def run(args: Args) -> int:
     """Measures; always 0, since to refuse a slope is no failure."""
@@ -55,18 +47,19 @@ def run(args: Args) -> int:
     enable_cache()
     call_at_once()
     from moonteam.physics.trials.slopes import measure
+    from moonteam.report import command, provenance, tables
     from moonteam.robots import KINDS
 
     rows = [row for kind in dict.fromkeys(args.kind) for roughness in args.roughness
             for degrees in args.degrees
             for row in measure(KINDS[kind], degrees, roughness, args.count, args.seed)]
-    report = {"seed": args.seed, "rows": rows}
+    meta = provenance.meta(command.line("evaluate slopes", args), args.seed)
+    report = {"seed": args.seed, "rows": rows, "notes": NOTES, "meta": meta}
+    shown = [([*COLUMNS], [_cells(row) for row in rows])]
     if args.out:
-        write_json(args.out / "slopes.json", report)
-    if args.markdown:
-        print(_markdown(args, rows))
-    else:
-        print(dump_json(report, 2) if args.json else _table(rows))
+        tables.save_plain(args.out, "slopes", report, shown)
+    tables.print_as(args, report, lambda: tables.plain_markdown(report, shown),
+                    lambda: print(_table(rows)))
     return 0
 
 
@@ -95,6 +88,8 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 COLUMNS = ("kind", "rms, cm", "slope, deg", "way", "arrived", "fell", "stuck", "farthest, m",
            "speed, m/s", "cross p95, m", "tilt max, deg", "energy, J/m")
+NOTES = ["Means are over arrivals; farthest: the most any drive got of its 13 m, whose slope "
+         "begins at 2.5 m."]
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
@@ -102,19 +97,3 @@ def _table(rows: list[dict[str, Any]]) -> str:
     widths = [max(len(line[i]) for line in table) for i in range(len(COLUMNS))]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
                      for line in table)
-
-
-def _markdown(args: Args, rows: list[dict[str, Any]]) -> str:
-    from moonteam.report import provenance
-
-    def words(values: tuple[float, ...]) -> str:
-        return " ".join(f"{v:g}" for v in values)
-
-    command = (f"moonteam evaluate slopes --kind {' '.join(args.kind)} "
-               f"--degrees {words(args.degrees)} --roughness {words(args.roughness)} "
-               f"--count {args.count} --seed {args.seed}")
-    lines = [f"`{command}`", "", "| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
-    return "\n".join([*lines, "", "- Means are over arrivals; farthest: the most any drive got "
-                      "of its 13 m, whose slope begins at 2.5 m.",
-                      f"- {provenance.hardware_line(provenance.meta(command, args.seed))}"])

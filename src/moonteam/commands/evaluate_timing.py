@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from moonteam import compilation, files, paths
-from moonteam.commands.evaluate_grid import Many, command_line
+from moonteam.commands.options import Many, Reported, Seeded
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, Reported):
     """Measure planning time on this machine: exact, greedy and exhaustive search, and a policy.
 
     Whole plans and single decisions are kept apart, and first calls (compiling) from later
     ones. The text under the table says where the exact planner is faster; it is computed from
     the measurements. The process is kept on one core. Run it on a quiet machine.
+
+    Files in --out: report.json, timing.csv, table.md and timing.png.
 
     Examples:
       moonteam evaluate timing
@@ -37,14 +38,6 @@ class Args:
     """K of the policy's best-of-K plan."""
     budget: float = 10.0
     """Seconds that a planner may spend on a size; it then has fewer calls to take a median of."""
-    seed: int = 0
-    """Seed of the scenarios."""
-    json: bool = False
-    """Print one JSON document and nothing else."""
-    markdown: bool = False
-    """Print the table as Markdown and nothing else."""
-    out: Path | None = None
-    """Folder for report.json, timing.csv, table.md and timing.png."""
 
 
 def run(args: Args) -> int:
@@ -59,9 +52,8 @@ def run(args: Args) -> int:
 
     shown = [timing.pivot(document)]
     if args.out:
-        files.write_json(args.out / "report.json", document)
+        tables.save_plain(args.out, "report", document, shown)
         files.write_text(args.out / "timing.csv", tables.plain_csv(document["rows"]))
-        files.write_text(args.out / "table.md", tables.plain_markdown(document, shown) + "\n")
         figures.timing(args.out / "timing.png", document)
     tables.print_plain(args, document, shown)
     return 0
@@ -72,17 +64,11 @@ def _measured(args: Args, cores: str) -> dict:
     compilation.enable_cache()
     from moonteam.evaluation.speed import timing
     from moonteam.planners.learned import Policy
+    from moonteam.report import command
 
     sizes = timing.Sizes(args.targets or (3, 4, 5, 6, 7, 8, 9, 10, 12), args.count, args.agents,
                          args.side, budget=args.budget, best_of=args.best_of, seed=args.seed)
     sizes.check()
     policy = Policy.load(paths.find(args.policy, "policies", ".safetensors")) \
         if args.policy else None
-    command = command_line("evaluate timing", [], {
-        "targets": args.targets, "policy": args.policy,
-        "count": args.count if args.count != 50 else None,
-        "agents": args.agents if args.agents != 3 else None,
-        "side": args.side if args.side != 32 else None,
-        "best-of": args.best_of if args.best_of != 16 else None,
-        "budget": args.budget if args.budget != 10.0 else None, "seed": args.seed or None})
-    return timing.evaluate(policy, sizes, command, cores)
+    return timing.evaluate(policy, sizes, command.line("evaluate timing", args), cores)

@@ -10,8 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from moonteam.commands.options import Reported
 from moonteam.errors import InputError
-from moonteam.files import dump_json, replacing, write_json
+from moonteam.files import replacing
+from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
     from moonteam.physics.trials.film import Shot
@@ -22,12 +24,14 @@ EXTENT = 26.0
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Reported):
     """Random straight traverses: arrivals, falls, cross-track error, speed, energy, tilt.
 
     Routes are drawn at random on seeded sites; those that cross ground the kind may not enter
     (slope over its footprint, boulders) are drawn again, and the number of draws is reported.
     Means are over traverses that arrived, intervals are 95 %.
+
+    Files in --out: traverse.json, traverse.csv and table.md.
 
     Examples:
       moonteam evaluate traverse --kind wheeled --site mare
@@ -56,16 +60,7 @@ class Args:
     backend: Literal["native", "mjx"] = "native"
     """physics engine"""
 
-    json: bool = False
-    """print one JSON document and nothing else"""
-
-    markdown: bool = False
-    """print the table for a page of docs, with command, commit and machine"""
-
-    out: Path | None = None
-    """folder for traverse.json and traverse.csv"""
-
-    video: bool = False
+    video: Aside[bool] = False
     """film each kind on the highest rim, by the most boulders and on the steepest slope, as
     KIND-rim.mp4 and so on, with a contact sheet; needs --out"""
 
@@ -83,25 +78,28 @@ def run(args: Args) -> int:
     enable_cache()
     call_at_once()
     from moonteam.physics.trials.traverse import summarise
+    from moonteam.report import command, provenance, tables
 
     summaries, rows, stills = [], [], []
     for kind in dict.fromkeys(args.kind):
         mine, draws = _run_kind(args, kind, stills)
         summaries.append(summarise(mine) | {"route_draws": draws})
         rows += mine
-    report = {"site": args.site, "seeds": list(_seeds(args)), "length_m": args.length,
-              "backend": args.backend, "summary": summaries, "rows": [asdict(r) for r in rows]}
+    seeds = list(_seeds(args))
+    report = {"site": args.site, "seeds": seeds, "length_m": args.length,
+              "backend": args.backend, "summary": summaries, "rows": [asdict(r) for r in rows],
+              "notes": [f"Site seeds {', '.join(map(str, seeds))}; means are over arrivals."],
+              "meta": provenance.meta(command.line("evaluate traverse", args), args.seed)}
+    shown = [_page(summaries)]
     if args.out:
-        write_json(args.out / "traverse.json", report)
+        tables.save_plain(args.out, "traverse", report, shown)
         _write_csv(args.out / "traverse.csv", rows)
         if stills:
             from moonteam.physics.trials.film import contact_sheet
 
             contact_sheet(stills, args.out / "sheet.png")
-    if args.markdown:
-        print(_markdown(args, summaries))
-    else:
-        print(dump_json(report, 2) if args.json else _table(summaries))
+    tables.print_as(args, report, lambda: tables.plain_markdown(report, shown),
+                    lambda: print(_table(summaries)))
     return 0 if all(r.outcome == "arrived" for r in rows) else 1
 
 
@@ -196,13 +194,8 @@ def _table(summaries: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def _markdown(args: Args, summaries: list[dict]) -> str:
-    """The summaries as a table of docs/results.md."""
-    from moonteam.report import provenance
-
-    command = (f"moonteam evaluate traverse --kind {' '.join(args.kind)} --site {args.site} "
-               f"--count {args.count} --sites {args.sites} --seed {args.seed} "
-               f"--length {args.length:g} --backend {args.backend}")
+def _page(summaries: list[dict]) -> tuple[list[str], list[list[str]]]:
+    """The summaries as titles and rows of a page of docs."""
     columns = {
         "kind": "{kind}", "arrived": "{arrived} of {count}",
         "95 %": "{arrived_interval[0]:.3f} to {arrived_interval[1]:.3f}",
@@ -212,12 +205,7 @@ def _markdown(args: Args, summaries: list[dict]) -> str:
         "p95, m": "{cross_track_p95_m:.3f}", "energy, J/m": "{energy_j_per_m:.1f}",
         "propellant, g": "{propellant_g:.1f}", "tilt p95, deg": "{tilt_p95_deg:.1f}",
         "tilt max, deg": "{tilt_max_deg:.1f}", "routes drawn": "{route_draws}"}
-    lines = [f"`{command}`", "", "| " + " | ".join([*columns, *means]) + " |",
-             "|" + "---|" * (len(columns) + len(means))]
-    for summary in summaries:
-        cells = [text.format(**summary) for text in columns.values()]
-        cells += [text.format(**summary) if summary["arrived"] else "-" for text in means.values()]
-        lines.append("| " + " | ".join(cells) + " |")
-    seeds = ", ".join(str(seed) for seed in _seeds(args))
-    return "\n".join([*lines, "", f"- Site seeds {seeds}; means are over arrivals.",
-                      f"- {provenance.hardware_line(provenance.meta(command, args.seed))}"])
+    rows = [[text.format(**summary) for text in columns.values()]
+            + [text.format(**summary) if summary["arrived"] else "-" for text in means.values()]
+            for summary in summaries]
+    return [*columns, *means], rows

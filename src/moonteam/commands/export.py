@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import tyro
 
 from moonteam import compilation, files, paths
+from moonteam.commands.options import Printed, Seeded
 from moonteam.errors import InputError
+from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
     from moonteam.planners.learned import Policy
@@ -18,7 +20,7 @@ TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Seeded, Printed):
     """Write a policy as a self-contained ONNX file and hold it against the original.
 
     The file takes any number of robots and targets where the policy does; its metadata say
@@ -33,14 +35,10 @@ class Args:
 
     policy: tyro.conf.Positional[str]
     """Policy file (.safetensors) or the name of a bundled policy."""
-    out: Path | None = None
+    out: Aside[Path | None] = None
     """The file to write; the policy's name with .onnx in this folder if not given."""
     states: int = 1000
     """States to compare on, at least."""
-    seed: int = 0
-    """Seed of the scenarios that they come from."""
-    json: bool = False
-    """Print one JSON document and nothing else."""
 
 
 def model_of(policy: Policy) -> bytes:

@@ -11,6 +11,7 @@ from typing import Literal
 import tyro
 
 from moonteam import files, paths
+from moonteam.commands.options import Printed, Saved
 from moonteam.errors import InputError
 from moonteam.planners.base import Objective, Plan, Snapshot
 from moonteam.problem import mission, scenario
@@ -20,11 +21,13 @@ PlannerName = Literal["exact", "greedy", "lns", "cpsat", "exhaustive", "policy"]
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Saved, Printed):
     """Plan a scenario: who goes where, with whom and when; with a certificate if exact.
 
     SCENARIO is a scenario file (.json), one line of a set (set.jsonl:INDEX, counted from 0,
     or set.jsonl:ID), a mission (.yaml), or the name of a bundled set or mission.
+
+    Files in --out: plan.json and plan.png.
 
     Examples:
       moonteam plan scenario.json --objective moves
@@ -55,10 +58,6 @@ class Args:
     """0 (time) to 1 (effort), for a policy that takes one."""
     seed: int = 0
     """Seed of lns and of a policy that samples."""
-    json: bool = False
-    """Print the plan as one JSON document and nothing else."""
-    out: Path | None = None
-    """Folder for plan.json and plan.png."""
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,14 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from moonteam import compilation, files
+from moonteam.commands.options import Printed, Saved
 from moonteam.errors import InputError
 from moonteam.problem import scenario
 from moonteam.problem.scenario import ACTIONS, Scenario
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Saved, Printed):
     """Trace a list of actions through the grid: positions, solved, rewards, observations.
 
     ACTIONS is a JSON list of steps, each a list of one action an agent, by name (up, down,
@@ -26,6 +27,8 @@ class Args:
     Entry 0 of the trace is the reset. Reward terms are unweighted, with the sign they carry
     into the sum; `total` is the sum with the weights of --phase. The whole list is traced,
     also past the step that solves the last target.
+
+    File in --out: replay.json.
 
     Examples:
       moonteam replay scenario.json actions.json
@@ -49,10 +52,6 @@ class Args:
     """The last so many targets of the scenario appear only when others are solved."""
     id: Annotated[str, tyro.conf.arg(metavar="ID")] = ""
     """Which scenario of a set of several."""
-    json: bool = False
-    """Print one JSON document and nothing else."""
-    out: Path | None = None
-    """Folder to write replay.json into."""
 
 
 def choose(path: Path, name: str) -> Scenario:

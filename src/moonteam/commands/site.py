@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
+from moonteam.commands.options import Printed, Saved
 from moonteam.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Saved, Printed):
     """Make a site from a preset, or import an elevation model, and preview it.
 
     Writes heights.npy and heights.tif, site.json (measured slopes, roughness, crater counts
@@ -67,11 +68,6 @@ class Args:
     detail: bool = True
     """add relief finer than --dem, continuing its power spectrum"""
 
-    json: bool = False
-    """print one JSON document and nothing else"""
-
-    out: Path | None = None
-    """folder to write to; without it nothing is written"""
 
 
 def run(args: Args) -> int:

@@ -7,13 +7,14 @@ import sys
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from moonteam import files
+from moonteam.commands.options import Printed
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Optimal, Scenario, save_set
 
@@ -52,7 +53,7 @@ NAMES = tuple(recipe.name() for recipe in RECIPES)
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Printed):
     """Makes the test sets, one .jsonl file each, with index.json that tells how.
 
     Every scenario can be solved within its 128 steps; draws that cannot are drawn again.
@@ -83,8 +84,6 @@ class Args:
     starts: int = 2
     """Starts of the large-neighbourhood search."""
 
-    json: bool = field(default=False)
-    """Print the index as one JSON document."""
 
 
 def draws(recipe: Recipe, seed: int) -> Iterator[Scenario]:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.metadata
 import platform
-import shlex
 import subprocess
-from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 import moonteam
 from moonteam.compilation import cores
@@ -37,27 +33,6 @@ def git(folder: Path, *words: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
-
-
-def command(name: str, args: Any, left_out: Collection[str],
-            positional: Collection[str] = ()) -> str:
-    """The command that makes a report again; options at their default are left out.
-
-    `args` is the dataclass of a command called `name`.
-    """
-    words = ["moonteam", *name.split()]
-    for field in dataclasses.fields(args):
-        value = getattr(args, field.name)
-        if field.name in left_out or value == field.default:
-            continue
-        words += [] if field.name in positional else [flag(field.name)]
-        words += map(str, value if isinstance(value, tuple) else (value,))
-    return shlex.join(words)
-
-
-def flag(name: str) -> str:
-    """The option of a field."""
-    return f"--{name.replace('_', '-')}"
 
 
 def processor() -> str:

@@ -161,6 +161,13 @@ def plain_markdown(document: dict, tables: Sequence[tuple[list[str], list[list[s
     return "\n".join([*lines, f"- {hardware_line(document['meta'])}"])
 
 
+def save_plain(folder: Path, name: str, document: dict,
+               tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
+    """The document as `name`.json and its tables as table.md."""
+    files.write_json(folder / f"{name}.json", document)
+    files.write_text(folder / "table.md", plain_markdown(document, tables) + "\n")
+
+
 def show_plain(document: dict, tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
     """The same on the terminal."""
     from rich.console import Console

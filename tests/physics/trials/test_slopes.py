@@ -44,7 +44,10 @@ def test_the_command_prints_one_document(monkeypatch, capsys):
     monkeypatch.setattr(slopes, "measure", lambda *a, **k: [row])
     words = ["evaluate", "slopes", "--kind", "legged", "--degrees", "12", "--roughness", "0"]
     assert main([*words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"seed": 0, "rows": [row]}
+    report = json.loads(capsys.readouterr().out)
+    assert report["rows"] == [row]
+    assert report["meta"]["command"] == (
+        "moonteam evaluate slopes --kind legged --degrees 12 --roughness 0")
     assert main(words) == 0
     assert main([*words, "--markdown"]) == 0
     text = capsys.readouterr().out

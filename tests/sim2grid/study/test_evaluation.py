@@ -242,8 +242,8 @@ def test_the_command_writes_its_folder_and_goes_on_where_it_was_stopped(
     assert len((tmp_path / "rows.csv").read_text().splitlines()) == 9
     assert "closed" in (tmp_path / "table.md").read_text()
     assert report["meta"]["command"] == (
-        "moonteam evaluate execution --site flat --count 4 --loop closed open --planner exact "
-        "--targets 2 --side 6 --width 2")
+        "moonteam evaluate execution --targets 2 --side 6 --site flat --count 4 "
+        "--loop closed open --planner exact --width 2")
     journal = tmp_path / "rows.jsonl"
     lines = journal.read_text().splitlines(keepends=True)
     assert len(lines) == 8

@@ -1,0 +1,119 @@
+"""Options that several commands have, and the reading of a command's words.
+
+A command's `Args` inherits the groups that it needs; tyro takes the help from here too. What no
+figure depends on is marked `Aside`, so that printed command lines leave it out. The options of
+the groups are given by name only, so that a command can have required ones of its own.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+from moonteam.report.command import Aside
+
+T = TypeVar("T")
+
+Many = tyro.conf.UseAppendAction
+"""An option that is given again for each of several values."""
+
+
+def parse(kind: type[T], name: str, words: Sequence[str], default: T | None = None) -> T:
+    """The words after `moonteam NAME`, read into a command's `Args`.
+
+    With a `default`, whose values then are the options' own, each flag has its opposite too.
+    """
+    return tyro.cli(kind, prog=f"moonteam {name}", args=words, default=default,
+                    description=inspect.getdoc(kind),
+                    config=(tyro.conf.FlagCreatePairsOff,) if default is None else ())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Printed:
+    """How a result is printed."""
+
+    json: Aside[bool] = False
+    """Print one JSON document and nothing else."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Saved:
+    """Where a result is written to."""
+
+    out: Aside[Path | None] = None
+    """Folder to write files to; without it nothing is written."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reported(Saved, Printed):
+    """How a report is printed and saved."""
+
+    markdown: Aside[bool] = False
+    """Print the tables as Markdown, with command, commit and machine, and nothing else."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeded:
+    """The seed of a command that has one."""
+
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resumable:
+    """Going on with what was interrupted."""
+
+    resume: Aside[bool] = False
+    """Go on with the run in the folder; the options must be the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFolder(Resumable):
+    """Where a training run lives."""
+
+    out: Aside[Path | None] = None
+    """Run folder; runs/NAME-SEED if not given, NAME being the word after `train`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limited:
+    """The beginning of a set."""
+
+    limit: int | None = None
+    """Only the first so many scenarios of a set."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn(Seeded):
+    """Scenarios drawn where no set is given."""
+
+    count: int = 200
+    """Without SET: scenarios to draw."""
+    agents: int = 3
+    """Without SET: agents of each scenario drawn."""
+    targets: int = 5
+    """Without SET: targets of each scenario drawn."""
+    side: int = 32
+    """Without SET: cells of a side of the map."""
+    max_steps: int = 128
+    """Without SET: steps in which a scenario must be solved."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Missions(Seeded):
+    """Random missions in physics."""
+
+    site_seed: int = 0
+    """Seed of the ground; --seed is that of the rest."""
+    targets: int = 5
+    """Targets of each mission, before events."""
+    side: int = 32
+    """Cells of a side of the map."""
+    max_steps: int = 128
+    """Joint decisions after which a mission has failed."""
