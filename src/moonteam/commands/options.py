@@ -28,9 +28,11 @@ def parse(kind: type[T], name: str, words: Sequence[str], default: T | None = No
 
     With a `default`, whose values then are the options' own, each flag has its opposite too.
     """
-    return tyro.cli(kind, prog=f"moonteam {name}", args=words, default=default,
-                    description=inspect.getdoc(kind),
-                    config=(tyro.conf.FlagCreatePairsOff,) if default is None else ())
+    prog, about = f"moonteam {name}", inspect.getdoc(kind)
+    if default is not None:
+        return tyro.cli(kind, prog=prog, args=words, default=default, description=about)
+    return tyro.cli(kind, prog=prog, args=words, description=about,
+                    config=(tyro.conf.FlagCreatePairsOff,))
 
 
 @dataclass(frozen=True, kw_only=True)
