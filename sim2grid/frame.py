@@ -10,9 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 HYSTERESIS = 0.05
 """Fraction of a cell by which a robot must be past a border before its cell changes."""
 
@@ -66,8 +63,9 @@ class Frame:
         return ((at < -margin) | (at > self._size(xp, xy) + margin)).any(-1)
 
 
-def tilt(quat: npt.NDArray) -> npt.NDArray:
+def tilt(quat: Any) -> Any:
     """Angle [...] rad between a body's z axis and up, from quaternions [..., 4] wxyz."""
+    xp = quat.__array_namespace__()
     x, y = quat[..., 1], quat[..., 2]
-    norm = np.maximum((quat ** 2).sum(-1), 1e-12)
-    return np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y) / norm, -1.0, 1.0))
+    norm = xp.maximum((quat ** 2).sum(-1), 1e-12)
+    return xp.arccos(xp.clip(1.0 - 2.0 * (x * x + y * y) / norm, -1.0, 1.0))

@@ -265,7 +265,7 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
         def look() -> None:
             looks.append(time.perf_counter())
             solved = int(execution.snapshot.solved.sum())
-            update(solved, f"{execution.time:.1f} s, decision {execution.decision}, "
+            update(solved, f"{execution.book.time:.1f} s, decision {execution.book.decision}, "
                            f"{solved} of {len(execution.record.targets)} targets")
             if show:
                 show(execution)
@@ -274,7 +274,7 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
     if not looks:
         return {"compile_s": 0.0, "wall_s": time.perf_counter() - begun}
     running = looks[-1] - looks[0]
-    simulated = execution.record.seconds() - execution.rules.chunk_s
+    simulated = execution.record.seconds() - execution.asked.rules.chunk_s
     return {"compile_s": round(looks[0] - begun, 3), "wall_s": round(looks[-1] - begun, 3),
             "real_time_factor": round(simulated / max(running, 1e-9), 3)}
 
@@ -286,7 +286,7 @@ def _report(made: Run) -> Report:
     prepared = made.prepared
     return make_report(
         made.execution.record, prepared.mission, prepared.frame, prepared.bases,
-        planner=made.who, objective=made.objective, mode=made.execution.mode,
+        planner=made.who, objective=made.objective, mode=made.execution.asked.mode,
         backend=made.backend, seed=made.seed, grid_plan=made.plan,
         height=ground_height(prepared.site.heights, prepared.site.spacing))
 

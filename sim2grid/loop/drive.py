@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.robots.base import CONTROL_PERIOD, Command
+from moonteam.trees import where
 from sim2grid.loop.brains import ask
 from sim2grid.loop.execution import Execution
 
@@ -74,7 +75,7 @@ class _Rows:
     def __init__(self, executions: Sequence[Execution], backend: Backend, poses: npt.NDArray,
                  queues: list[list[int]]):
         self._executions, self._backend, self._queues = executions, backend, queues
-        self._poses, self._rules = poses, executions[0].rules
+        self._poses, self._rules = poses, executions[0].asked.rules
         self._now: list[int | None] = [None] * len(queues)
         self._idle = np.ones(len(queues), bool)
         self._state: Any = None
@@ -116,12 +117,8 @@ class _Rows:
         if self._state is None:
             self._state = start
             return
-
-        def pick(new: Any, old: Any) -> npt.NDArray:
-            chosen = fresh.reshape(-1, *[1] * (np.ndim(new) - 1))
-            return np.where(chosen, np.asarray(new), np.asarray(old))
-
-        self._state = jax.tree.map(pick, start, self._state)
+        self._state = where(fresh, jax.tree.map(np.asarray, start),
+                            jax.tree.map(np.asarray, self._state))
 
     def advance(self) -> None:
         """Runs the engine to the next look and tells the executions; idle rows stand still."""

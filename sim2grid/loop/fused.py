@@ -35,7 +35,8 @@ from moonteam.planners.learned import Brain
 from moonteam.problem.scenario import Scenario
 from moonteam.robots.base import Command
 from sim2grid.frame import Frame
-from sim2grid.loop.execution import Body, Rules
+from sim2grid.loop.asked import Body
+from sim2grid.loop.rules import Rules
 from sim2grid.waypoints import SLOTS
 
 UNDER_WAY, SUCCESS, MAX_STEPS, UNSOLVABLE, ENGINE = range(5)  # how a mission stands
@@ -391,7 +392,7 @@ def _observe(setup: Setup, problem: Problem, fields: Array | None, now: Progress
     poses = jnp.stack([qpos[:, b:b + 7] for b in setup.bases], axis=1)  # [S, R, 7]
     seconds = _seconds(setup, now.look + 1)
     finite = jnp.all(jnp.isfinite(poses), axis=(0, 2))
-    over = jnp.min(_tilt(poses[..., 3:7]), axis=0) > rules.fall_tilt
+    over = jnp.min(_tilt(poses[..., 3:7]), axis=0) > np.radians(60.0)
     tilted = jnp.where(over, now.tilted_s + rules.chunk_s, 0.0)
     xy = jnp.where(finite[:, None], poses[-1, :, :2], now.xy)
     cause = jnp.where(setup.frame.off_map(xy), OFF_THE_MAP, PRESENT)

@@ -16,7 +16,7 @@ from moonteam.robots import KINDS
 from moonteam.terrain.site import Site, for_mission
 from moonteam.terrain.traversability import FLYERS, passable_cells
 from sim2grid.frame import Frame
-from sim2grid.loop.execution import Body
+from sim2grid.loop.asked import Body
 from sim2grid.loop.replan import grid_problem, unsolvable
 from sim2grid.waypoints import waypoints
 
@@ -63,7 +63,8 @@ def prepare(mission: Mission, source: object) -> Prepared:
         raise InputError(source, f"no robots with the skills of {mission.target_name(j)} can "
                          f"reach its cell {list(mission.targets[j].at)} over this ground; choose "
                          "another cell or seed", f"targets[{j}].at")
-    starts = waypoints(frame, [r.start for r in mission.robots], [True] * len(mission.robots))
+    starts = waypoints(frame, np.array([r.start for r in mission.robots]),
+                       np.ones(len(mission.robots), bool))
     scene = build_scene(site, [
         Placement(robot.name, KINDS[robot.kind], (float(x), float(y)))
         for robot, (x, y) in zip(mission.robots, starts, strict=True)])

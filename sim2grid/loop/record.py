@@ -6,20 +6,27 @@ Seconds are mission seconds, decisions count joint actions from 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.problem.mission import Target
+from moonteam.problem.mission import Mission, Target
 from moonteam.problem.scenario import Cell
+from sim2grid.loop import rules
 
 Ending = Literal["arrived", "timeout", "lost", "cut"]
 LossCause = Literal["fallen", "stuck", "not_a_number", "off_the_map", "event"]
 ReplanCause = Literal["timeout", "wrong_cell", "robot_lost", "new_target", "slowed", "silent",
                       "heard_again", "impassable"]
 FailureCause = Literal["max_steps", "unsolvable", "plan_over", "engine", "interrupted"]
+
+LOSSES: dict[int, LossCause] = {
+    rules.FALLEN: "fallen", rules.STUCK: "stuck", rules.NOT_A_NUMBER: "not_a_number",
+    rules.OFF_THE_MAP: "off_the_map"}
+"""Why a robot left, by the numbers of `rules`."""
 
 XY = npt.NDArray[np.float64]  # [2] m
 
@@ -113,3 +120,18 @@ class Record:
     def solved_at(self, time_s: float) -> set[int]:
         """Targets solved by a mission second."""
         return {s.target for s in self.solves if s.time_s <= time_s + 1e-9}
+
+
+def failed_words(record: Record, solved: npt.NDArray[np.bool_], limit: int | None = None) -> str:
+    """Which targets [M] are open at the end of `limit` decisions, or of a plan."""
+    names = ", ".join(record.target_names[j] for j in np.flatnonzero(~solved))
+    over = "when the plan was over" if limit is None else f"within {limit} decisions"
+    return f"{names} not solved {over}"
+
+
+def unsolvable_words(record: Record, mission: Mission, targets: Sequence[int]) -> str:
+    """Which targets can never be solved, and who is missing."""
+    names = ", ".join(record.target_names[j] for j in targets)
+    gone = ", ".join(f"{mission.robots[x.robot].name} ({x.cause})" for x in record.losses)
+    return (f"the robots that are left cannot solve {names}"
+            + (f"; lost: {gone}" if gone else ""))

@@ -107,7 +107,8 @@ class LiveView:
             color = rgba(SOLVED if j in solved else OPEN)
             found += square(scene, centre, 0.92 * frame.cell_m, color, 0.035 * frame.cell_m)
             found += post(scene, centre, color, height=0.9, label=record.target_names[j])
-        for i, (base, leg) in enumerate(zip(self._prepared.bases, execution.legs, strict=True)):
+        for i, (base, leg) in enumerate(zip(self._prepared.bases, execution.book.legs,
+                                              strict=True)):
             color = rgba(robot_color(i))
             at = record.qpos[-1][-1][base:base + 3].astype(float)
             trail = self._trails[i]

@@ -81,7 +81,7 @@ def _stepwise(fleet: Fleet, engine: str, decider: Decider, params: Any
     executions = [Execution(mission, scenario, planner, fleet.bodies, fleet.frame)
                   for mission, scenario in zip(fleet.missions, fleet.scenarios, strict=True)]
     backend = make_backend(engine, fleet.scene)
-    compile_s = backend.compile(len(executions), executions[0].rules.chunk_steps)
+    compile_s = backend.compile(len(executions), executions[0].asked.rules.chunk_steps)
     begun = time.perf_counter()
     planner.act(executions[0].snapshot)
     compile_s += time.perf_counter() - begun

@@ -26,10 +26,12 @@ import numpy as np
 from moonteam import paths
 from moonteam.planners.base import Objective, Planner
 from moonteam.problem.mission import Mission
+from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.brains import planner_maker
 from sim2grid.loop.drive import Backend, run
-from sim2grid.loop.execution import Execution, Mode, Route, Rules
+from sim2grid.loop.execution import Execution
 from sim2grid.loop.record import Record
+from sim2grid.loop.rules import Rules
 from sim2grid.measure.metrics import GridPlan, Report, make_report
 from sim2grid.measure.slip import ground_height
 from sim2grid.study.fleet import Fleet, Recipe, make_fleet
@@ -177,7 +179,7 @@ class Group:
             nonlocal done
             k = todo[index]
             report = self._report(contender, k, executions[index].record, grid[k].plan)
-            executions[index].record = Record()  # its poses are not needed any more
+            executions[index].book.record = Record()  # its poses are not needed any more
             self._keep(contender, k, report, grid[k])
             done += 1
             self._all.progress(title, done, len(self._fleet.missions))
@@ -254,7 +256,7 @@ def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) ->
     plan = GridPlan(record.success, makespan, moves)
     report = make_report(record, mission, fleet.frame, [body.base for body in bodies],
                          planner=execution.planner.name, objective=None, mode="barrier",
-                         backend="grid", seed=execution.seed, grid_plan=plan)
+                         backend="grid", seed=execution.asked.seed, grid_plan=plan)
     starts = [robot.start for robot in mission.robots]
     return OnGrid(on_the_clock(report, times), plan, route_of(record, starts),
                   round(float(times[-1]), 4))

@@ -42,7 +42,7 @@ from moonteam.terrain.site import Site as Ground
 from moonteam.terrain.site import for_mission
 from moonteam.terrain.traversability import FLYERS, passable_cells
 from sim2grid.frame import Frame
-from sim2grid.loop.execution import Body
+from sim2grid.loop.asked import Body
 from sim2grid.loop.replan import grid_problem, unsolvable, with_target
 from sim2grid.waypoints import waypoints
 
@@ -141,7 +141,8 @@ def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
 
 def placements(mission: Mission, frame: Frame) -> list[Placement]:
     """Where the robots of a mission stand at its start."""
-    starts = waypoints(frame, [r.start for r in mission.robots], [True] * len(mission.robots))
+    starts = waypoints(frame, np.array([r.start for r in mission.robots]),
+                       np.ones(len(mission.robots), bool))
     return [Placement(robot.name, KINDS[robot.kind], (float(x), float(y)))
             for robot, (x, y) in zip(mission.robots, starts, strict=True)]
 

@@ -9,6 +9,7 @@ Legend: B worlds, R robots, D decisions.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import msgspec
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sim2grid.frame import Frame
-from sim2grid.loop.execution import Body, Route
+from sim2grid.loop.asked import Body, Route
 from sim2grid.loop.record import Record
 from sim2grid.measure.metrics import Report
 
@@ -66,7 +67,7 @@ class IdealBackend:
 
 def ideal_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
     """The same robots as free joints side by side."""
-    return tuple(Body(7 * i, body.speed, body.flies) for i, body in enumerate(bodies))
+    return tuple(replace(body, base=7 * i) for i, body in enumerate(bodies))
 
 
 def ideal_start(frame: Frame, cells: Sequence[tuple[int, int]]) -> Floats:

@@ -34,8 +34,9 @@ from moonteam.report.intervals import Bootstrap
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.terrain.site import Boulder, make_site
 from moonteam.terrain.site import Site as Ground
+from sim2grid.loop.asked import Route
 from sim2grid.loop.drive import Backend
-from sim2grid.loop.execution import Execution, Route
+from sim2grid.loop.execution import Execution
 from sim2grid.measure.slip import ground_height
 from sim2grid.study.evaluation import Contender, Evaluation, Group, Row
 from sim2grid.study.fleet import Fleet, Recipe, make_fleet
@@ -187,8 +188,8 @@ class NoisyExecution(Execution):
     def __init__(self, *given: Any, noise_m: float, **options: Any):
         super().__init__(*given, **options)
         self.noise_m = noise_m
-        self._random = np.random.default_rng([self.seed, 77])
-        self._error = self._random.normal(scale=noise_m, size=(len(self.bodies), 2))
+        self._random = np.random.default_rng([self.asked.seed, 77])
+        self._error = self._random.normal(scale=noise_m, size=(len(self.asked.bodies), 2))
 
     def observe(self, qpos: npt.NDArray, power: npt.NDArray, propellant: npt.NDArray,
                 period: float = CONTROL_PERIOD) -> None:
@@ -208,13 +209,9 @@ class NoisyExecution(Execution):
         poses[:, :, :2] += self._error
         return poses
 
-    def _mark_solved(self) -> None:
-        believed, cells = self._xy, self.snapshot.cells
-        self._xy = np.nan_to_num(believed - self._error)
-        self.snapshot = replace(self.snapshot, cells=self.frame.cell(self._xy))
-        super()._mark_solved()
-        self._xy = believed
-        self.snapshot = replace(self.snapshot, cells=cells)
+    def _places(self) -> tuple[npt.NDArray, npt.NDArray[np.int32]]:
+        xy = np.nan_to_num(self.known.xy - self._error)
+        return xy, self.asked.frame.cell(xy)
 
 
 class DelayedBackend:

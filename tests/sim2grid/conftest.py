@@ -14,8 +14,9 @@ from moonteam.problem import mission as missions
 from moonteam.problem.scenario import ACTIONS
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.frame import Frame
+from sim2grid.loop.asked import Body
 from sim2grid.loop.drive import run
-from sim2grid.loop.execution import Body, Execution
+from sim2grid.loop.execution import Execution
 from sim2grid.loop.replan import grid_problem
 
 

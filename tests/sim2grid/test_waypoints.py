@@ -16,7 +16,7 @@ def test_who_comes_keeps_right_of_who_stands(way, comer):
     way = np.array(way, float)
     at = np.zeros((2, 2))
     at[comer] = -2.0 * way
-    points = waypoints(FRAME, [(2, 2), (2, 2)], [True, True], at)
+    points = waypoints(FRAME, np.array([(2, 2), (2, 2)]), np.ones(2, bool), at)
     right = 2.0 * LANE * np.array([way[1], -way[0]])
     np.testing.assert_allclose(points[comer], right)
     np.testing.assert_allclose(points[1 - comer], -right)
@@ -25,14 +25,15 @@ def test_who_comes_keeps_right_of_who_stands(way, comer):
 
 def test_who_stands_on_the_right_already_stays_there():
     at = np.array([[-2.0, 0.0], [0.0, -0.6]])
-    points = waypoints(FRAME, [(2, 2), (2, 2)], [True, True], at)
+    points = waypoints(FRAME, np.array([(2, 2), (2, 2)]), np.ones(2, bool), at)
     np.testing.assert_allclose(points, [[0.0, 0.6], [0.0, -0.6]])
 
 
 def test_two_that_pass_on_from_their_sides_never_come_near():
     """From a shared cell of 1 m, one goes on east, the other west."""
     frame = Frame((5, 5), 1.0)
-    sides = waypoints(frame, [(2, 2), (2, 2)], [True, True], np.array([[-1.0, 0], [0, 0]]))
+    sides = waypoints(frame, np.array([(2, 2), (2, 2)]), np.ones(2, bool),
+                      np.array([[-1.0, 0], [0, 0]]))
     ends = np.array([[1.0, 0.0], [-1.0, 0.0]])
     for share in np.linspace(0, 1, 50):
         both = sides + share * (ends - sides)
@@ -40,19 +41,22 @@ def test_two_that_pass_on_from_their_sides_never_come_near():
 
 
 def test_three_have_quarters_and_flyers_the_centre():
-    goals = [(2, 2)] * 4
-    points = waypoints(FRAME, goals, [True, True, False, True], np.zeros((4, 2)))
+    goals, grounded = np.array([(2, 2)] * 4), np.array([True, True, False, True])
+    points = waypoints(FRAME, goals, grounded, np.zeros((4, 2)))
     apart = np.linalg.norm(points[[0, 0, 1]] - points[[1, 3, 3]], axis=1)
     assert (apart > 0.8).all()
     np.testing.assert_allclose(points[2], CENTRE)
-    assert crowds(goals, [True, True, False, True]) == [[0, 1, 3]]
-    assert crowds([(0, 0), (0, 1), (0, 0)], [True, True, False]) == []
+    assert (crowds(goals, grounded) == grounded[:, None] & grounded[None]).all()
+    apart = crowds(np.array([(0, 0), (0, 1), (0, 0)]), np.array([True, True, False]))
+    assert (apart == np.diag([True, True, False])).all()
 
 
 def test_of_two_that_change_places_one_waits():
-    ground = [True, True]
-    assert yielding([(1, 0), (0, 0)], [(0, 0), (1, 0)], [0, 1], ground) == [1]
-    assert yielding([(1, 0), (0, 0)], [(0, 0), (1, 0)], [0], ground) == [0], "the other is going"
-    assert yielding([(1, 0), (0, 0)], [(0, 0), (1, 0)], [0, 1], [True, False]) == []
-    assert yielding([(1, 0), (2, 0)], [(0, 0), (1, 0)], [0, 1], ground) == [], "one follows"
-    assert yielding([(0, 0), (0, 0)], [(0, 0), (0, 0)], [0, 1], ground) == [], "they stand"
+    def waits(goals, cells, free=(True, True), grounded=(True, True)):
+        return yielding(*map(np.array, (goals, cells, free, grounded))).nonzero()[0].tolist()
+
+    assert waits([(1, 0), (0, 0)], [(0, 0), (1, 0)]) == [1]
+    assert waits([(1, 0), (0, 0)], [(0, 0), (1, 0)], (True, False)) == [0], "the other is going"
+    assert waits([(1, 0), (0, 0)], [(0, 0), (1, 0)], grounded=(True, False)) == []
+    assert waits([(1, 0), (2, 0)], [(0, 0), (1, 0)]) == [], "one follows"
+    assert waits([(0, 0), (0, 0)], [(0, 0), (0, 0)]) == [], "they stand"

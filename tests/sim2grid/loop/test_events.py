@@ -6,7 +6,7 @@ import pytest
 
 from moonteam.errors import InputError
 from moonteam.planners.exact import ExactPlanner
-from sim2grid.loop.execution import Route
+from sim2grid.loop.asked import Route
 
 
 def test_a_slowed_robot_gets_the_time_it_needs(mission, execute, script):
@@ -141,7 +141,7 @@ def test_the_clock_of_async_is_the_teams(mission, execute, script):
     done = execute(spec, planner, mode="async", faults={(1, 0.0): "leisurely"})
     assert [s.max_steps for s in planner.seen] == [128] * len(planner.seen)
     assert [s.step for s in planner.seen] == [k // 2 for k in range(len(planner.seen))]
-    assert done.limit == 256
+    assert done.asked.limit == 256
 
 
 def test_two_that_would_change_places_pass_each_other_in_one_cell(mission, execute):
@@ -161,7 +161,7 @@ def test_who_stays_behind_keeps_its_side(mission, execute, script):
     first, last = (leg.waypoint for leg in done.record.legs if leg.robot == 1 and
                    leg.decision in (0, 2))
     np.testing.assert_allclose(last, first)
-    assert np.abs(first - done.frame.centre(np.array([2.0, 0.0]))).max() == pytest.approx(0.3)
+    assert np.abs(first - done.asked.frame.centre(np.array([2.0, 0.0]))).max() == pytest.approx(0.3)
 
 
 def test_a_lost_robot_is_not_waited_for(mission, execute, script):

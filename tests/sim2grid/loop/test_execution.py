@@ -163,7 +163,8 @@ def test_async_lets_the_fast_robot_go_on(mission, execute, script):
 
 def test_robots_that_share_a_cell_get_their_own_places_flyers_the_centre():
     frame = Frame((4, 4), 2.0)
-    points = waypoints(frame, [(1, 1), (1, 1), (1, 1), (0, 0)], [True, False, True, True])
+    points = waypoints(frame, np.array([(1, 1), (1, 1), (1, 1), (0, 0)]),
+                       np.array([True, False, True, True]))
     np.testing.assert_allclose(points[1:4:2], [[-1, -1], [-3, -3]])
     assert np.hypot(*(points[0] - points[2])) > 1.2, "room for two bodies"
     assert frame.inside(points[[0, 2]], np.array([[1, 1], [1, 1]])).all()

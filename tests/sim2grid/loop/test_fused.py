@@ -82,8 +82,7 @@ def test_waypoints_of_robots_that_share_a_cell(prepared):
     rng = np.random.default_rng(0)
     for _ in range(20):
         goals = rng.integers(0, 2, (5, 2))
-        wanted = waypoints(prepared.frame, [tuple(g) for g in goals.tolist()],
-                           [not f for f in setup.flies])
+        wanted = waypoints(prepared.frame, goals, ~np.array(setup.flies))
         assert np.allclose(fused._waypoints(setup, jnp.asarray(goals)), wanted, atol=1e-6)
 
 
