@@ -98,9 +98,11 @@ def _decider(args: Args) -> tuple[Decider, Any]:
 def _document(args: Args, rows: list[dict[str, Any]]) -> dict[str, Any]:
     from moonteam.physics.trials.speed import device_name
     from moonteam.report import command, provenance
+    from sim2grid.study.fleet import TEAM
 
     notes = [
-        f"Drone, legged and wheeled robot, {args.targets} targets, {args.side} x {args.side} cells "
+        f"Robots: {', '.join(kind for _, kind in TEAM)}; {args.targets} targets, {args.side} x "
+        f"{args.side} cells "
         f"of {args.cell:g} m on {args.site}; decisions by {args.planner}"
         + (f" {Path(args.policy).stem}." if args.planner == "policy" else "."),
         "fused: one program on MJX for decisions, control and physics. native, mjx: step by step."]

@@ -25,7 +25,7 @@ PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
 class Args(Missions, Resumable, Reported):
     """Execute random missions in physics and compare what they cost with the grid's promise.
 
-    Each mission has a drone, a legged and a wheeled robot with random skills, random targets
+    Each mission has one robot of each of our own kinds with random skills, random targets
     and, if asked for, random events; all missions of a site stand on the same ground. A row of
     the table is a loop with a planner and a mode: closed (the planner decides again at each
     step, from where the robots really are), open (the grid plan walked through blindly, all

@@ -118,7 +118,7 @@ def run(args: Args) -> int:
     made = _from_file(args) if args.report is None else _from_report(args)
     mission = made.prepared.mission
     out = args.out or Path("runs") / mission.name
-    _make_folder(out, args, mission)
+    _make_folder(out, args, made.prepared.written)
     interrupted = False
     try:
         timing = _drive(args, made)
@@ -288,7 +288,7 @@ def _report(made: Run) -> Report:
         made.execution.record, prepared.mission, prepared.frame, prepared.bases,
         planner=made.who, objective=made.objective, mode=made.execution.asked.mode,
         backend=made.backend, seed=made.seed, grid_plan=made.plan,
-        height=ground_height(prepared.site.heights, prepared.site.spacing))
+        kinds=prepared.kinds, height=ground_height(prepared.site.heights, prepared.site.spacing))
 
 
 def _film(made: Run) -> Film:
@@ -298,7 +298,8 @@ def _film(made: Run) -> Film:
     prepared = made.prepared
     return Film(prepared.mission, made.execution.record, prepared.frame,
                 Ground(prepared.site.heights, prepared.site.spacing), prepared.bases,
-                made.title, prepared.barred())
+                made.title, prepared.barred(),
+                glyphs=[robot.kind.glyph for robot in prepared.scene.robots])
 
 
 def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], out: Path,
@@ -308,7 +309,7 @@ def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], 
 
     from sim2grid.show import page, plots
 
-    mission = msgspec.to_builtins(made.prepared.mission)
+    mission = msgspec.to_builtins(made.prepared.written)
     page.write(out / "report.html", page.rollout_page(
         report, command=made.command, made=video, out=out, timing=timing,
         replans=[(round(r.time_s, 1), r.decision, r.words) for r in film.story.replans],

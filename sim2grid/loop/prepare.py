@@ -12,9 +12,9 @@ from moonteam.physics.scene import Placement, Scene, build_scene
 from moonteam.planners.base import Snapshot
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
-from moonteam.robots import KINDS
+from moonteam.robots import team
 from moonteam.terrain.site import Site, for_mission
-from moonteam.terrain.traversability import FLYERS, passable_cells
+from moonteam.terrain.traversability import passable_cells
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body
 from sim2grid.loop.replan import grid_problem, unsolvable
@@ -23,9 +23,15 @@ from sim2grid.waypoints import waypoints
 
 @dataclass(frozen=True)
 class Prepared:
-    """A mission on its ground. `passable`: kind -> [H, W] bool, indexed [y, x]."""
+    """A mission on its ground. `passable`: kind -> [H, W] bool, indexed [y, x].
 
+    `written` is the mission as its file has it, where a kind may be FILE.py:OBJECT; everywhere
+    else kinds go by their names.
+    """
+
+    written: Mission
     mission: Mission
+    kinds: team.Kinds
     frame: Frame
     site: Site
     passable: dict[str, npt.NDArray[np.bool_]]
@@ -45,13 +51,16 @@ class Prepared:
 
 
 def prepare(mission: Mission, source: object) -> Prepared:
-    """Makes ground and scene. Raises InputError for a mission that its ground forbids.
+    """Makes ground and scene. Raises InputError for a kind that nobody knows, or a mission that
+    its ground forbids.
 
     `source` is the mission file, for messages.
     """
+    written = mission
+    mission, kinds = team.resolve(written, source)
     frame = Frame(mission.map.size, mission.map.cell_m)
     site = for_mission(mission)
-    passable = passable_cells(site, mission, {r.kind for r in mission.robots})
+    passable = passable_cells(site, mission, team.limits(kinds))
     for i, robot in enumerate(mission.robots):
         x, y = robot.start
         if not passable[robot.kind][y, x]:
@@ -66,7 +75,7 @@ def prepare(mission: Mission, source: object) -> Prepared:
     starts = waypoints(frame, np.array([r.start for r in mission.robots]),
                        np.ones(len(mission.robots), bool))
     scene = build_scene(site, [
-        Placement(robot.name, KINDS[robot.kind], (float(x), float(y)))
+        Placement(robot.name, kinds[robot.kind], (float(x), float(y)))
         for robot, (x, y) in zip(mission.robots, starts, strict=True)])
-    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.name in FLYERS) for r in scene.robots)
-    return Prepared(mission, frame, site, passable, scenario, scene, bodies)
+    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.flies) for r in scene.robots)
+    return Prepared(written, mission, kinds, frame, site, passable, scenario, scene, bodies)

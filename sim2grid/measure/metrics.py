@@ -7,7 +7,7 @@ depends on wall-clock time: the same record gives the same report.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -16,9 +16,10 @@ import numpy.typing as npt
 
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Cell
+from moonteam.robots.base import Height, RobotKind
 from sim2grid.frame import Frame, tilt
 from sim2grid.loop.record import Leg, Record
-from sim2grid.measure.slip import Height, slip
+from sim2grid.measure.slip import slip
 
 Floats = npt.NDArray[np.float64]
 
@@ -151,7 +152,8 @@ def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]
 
 
 def robot_report(mission: Mission, robot: int, track: Track, record: Record,
-                 frame: Frame, height: Height | None = None) -> RobotReport:
+                 frame: Frame, kind: RobotKind | None = None, height: Height | None = None
+                 ) -> RobotReport:
     """One robot's figures. Seconds per move are over moves that ended in arrival."""
     own = [leg for leg in record.legs if leg.robot == robot]
     sent = [leg for leg in own if leg.moving and leg.ended in ("arrived", "timeout")]
@@ -163,7 +165,7 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
     steps = np.diff(track.times)
     x, y = (int(v) for v in frame.cell(np.nan_to_num(track.xyz[-1, :2])))
     spec = mission.robots[robot]
-    slipped = None if track.qpos is None else slip(spec.kind, track.qpos, height)
+    slipped = None if track.qpos is None or kind is None else slip(kind, track.qpos, height)
     return RobotReport(
         name=spec.name, kind=spec.kind, skills=spec.skills, final_cell=(x, y),
         lost=loss.cause if loss else None, lost_s=_round(loss.time_s) if loss else None,
@@ -184,10 +186,15 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
 
 def make_report(record: Record, mission: Mission, frame: Frame, bases: Sequence[int], *,
                 planner: str, objective: str | None, mode: str, backend: str, seed: int,
-                grid_plan: GridPlan | None, height: Height | None = None) -> Report:
-    """The whole report; `bases` as in `tracks`, `height` as in `slip.slip`."""
+                grid_plan: GridPlan | None, kinds: Mapping[str, RobotKind] | None = None,
+                height: Height | None = None) -> Report:
+    """The whole report; `bases` as in `tracks`, `kinds` by name, `height` as in `slip.slip`.
+
+    Without its kind a robot's slip is not told.
+    """
     decisions = len(record.decisions)
-    robots = tuple(robot_report(mission, i, track, record, frame, height)
+    robots = tuple(robot_report(mission, i, track, record, frame,
+                                (kinds or {}).get(mission.robots[i].kind), height)
                    for i, track in enumerate(tracks(record, bases)))
     inflation = None
     if record.success and grid_plan is not None and grid_plan.makespan:

@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw
 
 from moonteam import files
 from moonteam.problem.mission import Mission
+from moonteam.robots.base import Glyph
 from sim2grid.frame import Frame
 from sim2grid.loop.record import Record
 from sim2grid.measure.story import Replan, Story
@@ -95,9 +96,12 @@ class Film:
 
     def __init__(self, mission: Mission, record: Record, frame: Frame, ground: Ground,
                  bases: Sequence[int], title: str,
-                 barred: npt.NDArray[np.bool_] | None = None, views: Views | None = None):
+                 barred: npt.NDArray[np.bool_] | None = None, views: Views | None = None,
+                 glyphs: Sequence[Glyph] = ()):
         self.mission, self.record, self.title, self.views = mission, record, title, views
         self.frame, self.ground, self.bases, self.barred = frame, ground, bases, barred
+        # How each robot is marked on the map.
+        self.glyphs: Sequence[Glyph] = glyphs or ("disc",) * len(mission.robots)
         self.story = Story(mission, record, frame, bases)
         self.times, self.qpos, self.paths = self.story.times, self.story.qpos, self.story.paths
         # A robot's close view is drawn afresh now and then, and when a target is solved.
@@ -108,7 +112,7 @@ class Film:
     def with_views(self, views: Views) -> Film:
         """The same film with 3-D pictures."""
         return Film(self.mission, self.record, self.frame, self.ground, self.bases, self.title,
-                    self.barred, views)
+                    self.barred, views, self.glyphs)
 
     def last_map(self, side: int) -> Image.Image:
         """The map at the end of the mission with every path, `side` pixels."""
@@ -186,7 +190,7 @@ class Film:
         for i, spec in enumerate(self.mission.robots):
             path = self.paths[i][:moment.index + 1]
             thinned = np.concatenate([path[::step], path[-1:]])
-            robots.append(RobotMark(spec.name, spec.kind, thinned, i in lost))
+            robots.append(RobotMark(spec.name, self.glyphs[i], thinned, i in lost))
         targets = [TargetMark(self.record.target_names[j], target, j in moment.solved)
                    for j, target in enumerate(self.record.targets[:moment.targets])]
         return robots, targets, [r.xy for r in moment.replans if r.xy is not None]
@@ -234,7 +238,7 @@ class Film:
     def _robot_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int]) -> None:
         x, y = at
         for i, spec in enumerate(self.mission.robots):
-            draw_robot(pen, spec.kind, (x + 7, y + 9), 7, robot_color(i))
+            draw_robot(pen, self.glyphs[i], (x + 7, y + 9), 7, robot_color(i))
             _shadowed(pen, (x + 20, y), f"{spec.name}  {spec.kind} {''.join(spec.skills)}", 13,
                       robot_color(i))
             _shadowed(pen, (x + 20, y + 16), _doing(moment, i), 12,
@@ -256,7 +260,7 @@ class Film:
             cut = (CLOSE[0] - width) // 2
             image.paste(self._close_view(moment, i, number).crop(
                 (cut, 0, cut + width, CLOSE[1])), (x, y))
-            draw_robot(pen, spec.kind, (x + 12, y + 12), 6, color)
+            draw_robot(pen, self.glyphs[i], (x + 12, y + 12), 6, color)
             _shadowed(pen, (x + 23, y + 3), spec.name, 12, color)
             _shadowed(pen, (x + 23, y + 18), f"{spec.kind} {''.join(spec.skills)}", 10, INK)
             word = moment.status[i]

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from moonteam.problem.mission import Target
+from moonteam.robots.base import Glyph
 from sim2grid.frame import Frame
 
 Color = tuple[int, int, int]
@@ -79,7 +80,7 @@ class RobotMark:
     """A robot on the map: its path so far [T, 2] m ends where it is."""
 
     name: str
-    kind: str
+    glyph: Glyph
     path: npt.NDArray
     lost: bool = False
 
@@ -185,7 +186,7 @@ class MapPicture:
                labels: bool) -> None:
         color = GREY if robot.lost else robot_color(index)
         x, y = self._pixels(robot.path[-1])
-        draw_robot(pen, robot.kind, (float(x), float(y)),
+        draw_robot(pen, robot.glyph, (float(x), float(y)),
                    max(self.pixel * 0.24, 4.5 * SMOOTH), color)
         if labels:
             size = round(max(self.pixel * 0.22, 12 * SMOOTH))
@@ -195,20 +196,26 @@ class MapPicture:
                   robot.name, color, size, "md" if above else "ma")
 
 
-def draw_robot(pen: ImageDraw.ImageDraw, kind: str, at: tuple[float, float], reach: float,
+def draw_robot(pen: ImageDraw.ImageDraw, glyph: Glyph, at: tuple[float, float], reach: float,
                color: Color) -> None:
-    """Triangle for a drone, disc for a legged robot, square for a wheeled one."""
+    """The mark of a robot's kind, about `reach` pixels from its middle to its edge."""
     x, y = at
     line = max(1, round(reach * 0.2))
-    if kind == "drone":
+    if glyph == "triangle":
         low = y + reach * 0.8
         corners = [(x, y - reach * 1.15), (x - reach, low), (x + reach, low)]
         pen.polygon(corners, fill=color, outline=NIGHT, width=line)
-    elif kind == "legged":
+    elif glyph == "disc":
         pen.ellipse([x - reach, y - reach, x + reach, y + reach], color, NIGHT, line)
-    else:
+    elif glyph == "square":
         side = reach * 0.85
         pen.rectangle([x - side, y - side, x + side, y + side], color, NIGHT, line)
+    else:
+        sides = {"pentagon": 5, "hexagon": 6}[glyph]
+        turns = 2 * np.pi * (np.arange(sides) / sides - 0.25)
+        corners = [(x + 1.1 * reach * float(np.cos(t)), y + 1.1 * reach * float(np.sin(t)))
+                   for t in turns]
+        pen.polygon(corners, fill=color, outline=NIGHT, width=line)
 
 
 def draw_replan(pen: ImageDraw.ImageDraw, at: tuple[float, float], reach: float) -> None:

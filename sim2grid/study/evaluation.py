@@ -210,7 +210,8 @@ class Group:
         return make_report(
             record, self._fleet.missions[k], self._fleet.frame, self._fleet.bases,
             planner=contender.who, objective=objective, mode=contender.mode,
-            backend=contender.backend, seed=self._seed(k), grid_plan=plan, height=self._height)
+            backend=contender.backend, seed=self._seed(k), grid_plan=plan, kinds=self._fleet.kinds,
+            height=self._height)
 
     def _keep(self, contender: Contender, k: int, report: Report, grid: OnGrid) -> None:
         recipe = self._fleet.missions[k].site

@@ -27,7 +27,6 @@ from moonteam.problem import mission as missions
 from moonteam.problem.mission import (
     Event,
     Impassable,
-    Kind,
     Map,
     Mission,
     Robot,
@@ -37,17 +36,17 @@ from moonteam.problem.mission import (
     Target,
 )
 from moonteam.problem.scenario import Scenario
-from moonteam.robots import KINDS
+from moonteam.robots import KINDS, OWN, team
 from moonteam.terrain.site import Site as Ground
 from moonteam.terrain.site import for_mission
-from moonteam.terrain.traversability import FLYERS, passable_cells
+from moonteam.terrain.traversability import passable_cells
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body
 from sim2grid.loop.replan import grid_problem, unsolvable, with_target
 from sim2grid.waypoints import waypoints
 
-TEAM: tuple[tuple[str, Kind], ...] = (
-    ("hopper", "drone"), ("strider", "legged"), ("rover", "wheeled"))
+TEAM: tuple[tuple[str, str], ...] = tuple(
+    (KINDS.get(kind).callsign or kind, kind) for kind in OWN)
 """Names and kinds of the robots of a random mission."""
 
 MOST_DRAWS = 10_000
@@ -97,6 +96,7 @@ class Fleet:
     frame: Frame
     site: Ground
     passable: dict[str, BoolArray]  # kind -> [H, W], indexed [y, x]
+    kinds: team.Kinds
     scene: Scene
     bodies: tuple[Body, ...]
     starts: npt.NDArray[np.float64]  # [F, nq]
@@ -117,7 +117,7 @@ def make_fleet(recipe: Recipe, count: int,
     empty = Mission(Map(size, recipe.cell_m), tuple(
         Robot(name, kind, ("A",), (0, 0)) for name, kind in TEAM), (), recipe.site)
     site = change(for_mission(empty))
-    passable = passable_cells(site, empty, {kind for _, kind in TEAM})
+    passable = passable_cells(site, empty, team.limits({kind: KINDS.get(kind) for kind in OWN}))
     drawn = [draw_mission(recipe, number, site, passable) for number in range(count)]
     return fleet_of([m for m, _ in drawn], [n for _, n in drawn], site, passable)
 
@@ -133,17 +133,18 @@ def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
         for robot, placement in zip(scene.robots, placements(mission, frame), strict=True):
             pose[robot.qpos] = start_pose(site, placement)
         starts.append(pose)
-    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.name in FLYERS) for r in scene.robots)
+    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.flies) for r in scene.robots)
     return Fleet(tuple(chosen), tuple(draws),
                  tuple(grid_problem(mission, passable) for mission in chosen),
-                 frame, site, passable, scene, bodies, np.stack(starts))
+                 frame, site, passable, {r.kind.name: r.kind for r in scene.robots}, scene, bodies,
+                 np.stack(starts))
 
 
 def placements(mission: Mission, frame: Frame) -> list[Placement]:
     """Where the robots of a mission stand at its start."""
     starts = waypoints(frame, np.array([r.start for r in mission.robots]),
                        np.ones(len(mission.robots), bool))
-    return [Placement(robot.name, KINDS[robot.kind], (float(x), float(y)))
+    return [Placement(robot.name, KINDS.get(robot.kind), (float(x), float(y)))
             for robot, (x, y) in zip(mission.robots, starts, strict=True)]
 
 
@@ -220,7 +221,7 @@ def _closed_ways(count: int, cells: IntArray, mission: Mission,
     """News that a cell which the exact plan, at `cells` [T + 1, R, 2], has yet to cross with a
     robot on the ground is closed to its kind.
     """
-    on_ground = [i for i, robot in enumerate(mission.robots) if robot.kind not in FLYERS]
+    on_ground = [i for i, robot in enumerate(mission.robots) if not KINDS.get(robot.kind).flies]
     found = []
     for _ in range(count):
         at, robot = when(), int(rng.choice(on_ground))

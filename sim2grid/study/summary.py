@@ -112,7 +112,7 @@ def legs_sent(robot: RobotReport) -> int:
 
 
 def failure_label(row: Row) -> str:
-    """Cause of a failed mission, with what was lost on the way: `unsolvable: legged stuck`."""
+    """Cause of a failed mission, with what was lost on the way: `unsolvable: KIND stuck`."""
     losses = sorted(f"{robot.kind} {robot.lost.replace('_', ' ')}" for robot in row.report.robots
                     if robot.lost)
     cause = (row.report.cause or "").replace("_", " ")

@@ -12,7 +12,7 @@ import pytest
 
 from moonteam.physics.backends import MjxBackend, NativeBackend, hold
 from moonteam.physics.scene import Placement, build_scene
-from moonteam.robots import KINDS
+from moonteam.robots import KINDS, OWN
 from moonteam.robots.base import CONTROL_PERIOD
 from moonteam.terrain.site import make_site
 
@@ -23,8 +23,8 @@ SECONDS = 5.0
 @pytest.fixture(scope="module")
 def scene():
     return build_scene(make_site("mare", 0, 16.0), [
-        Placement(name, kind, (3.0 * (i - 1), 0.0), 0.3 * i)
-        for i, (name, kind) in enumerate(KINDS.items())])
+        Placement(name, KINDS.get(name), (3.0 * (i - 1), 0.0), 0.3 * i)
+        for i, name in enumerate(OWN)])
 
 
 def sequence(scene):

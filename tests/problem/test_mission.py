@@ -53,8 +53,6 @@ BAD = {
     "target off the map": ("at: [3, 3]", "at: [3, 6]",
                            "targets[0].at: cell [3, 6] is off the map; x in 0..7, y in 0..5"),
     "start off the map": ("start: [0, 5]", "start: [-1, 5]", "robots[0].start: cell [-1, 5]"),
-    "unknown kind": ("kind: drone", "kind: submarine",
-                     "robots[0].kind: unknown value 'submarine'; allowed: drone, legged, wheeled"),
     "skill nobody has": ("skills: [camera]", "skills: [drill]",
                          "targets[1].skills: no robot has skill drill; the team has A, B, camera"),
     "duplicate names": ("name: rover", "name: flyer", "robots[1].name: 'flyer' is already"),

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
-from moonteam.robots import legged, tune_legged
+from moonteam.physics.trials import tune
+from moonteam.robots import legged
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.robots.legged import LEGGED
 from moonteam.terrain.surface import Surface
@@ -49,13 +50,13 @@ def drive(scene: Scene, orders, seconds, yaw=0.0, kick=(0.0, 0.0), limp=0.0):
         ctrl, state, _ = CONTROL(state, jnp.float32(0), *seen, now, scene.surface)
         data.ctrl[:] = ctrl
         most = max(most, float(np.abs(ctrl).max()))
-        mujoco.mj_step(model, data, tune_legged.SUBSTEPS)
+        mujoco.mj_step(model, data, tune.SUBSTEPS)
         bases.append(data.qpos[:3].copy())
     return data, np.array(bases), most
 
 
 def scene_of(heights) -> Scene:
-    site = tune_legged.site_of(heights, "test")
+    site = tune.site_of(heights, "test")
     return build_scene(site, [Placement("r", LEGGED, (0.0, 0.0))])
 
 
@@ -157,17 +158,17 @@ def test_controller_is_pure_and_vmaps():
 
 @pytest.fixture(scope="module")
 def walks():
-    site = tune_legged.course(7)
-    starts, goals = tune_legged.lanes(site)
+    site = tune.course(7)
+    starts, goals = tune.lanes(LEGGED, site)
     scene = build_scene(site, [Placement("r", LEGGED, (-4.5, 0.0))])
-    return tune_legged.walk(scene, starts, goals, 40.0)
+    return tune.walk(LEGGED, scene, starts, goals, 40.0)
 
 
 def lane(walks, name):
-    return tune_legged.Walks(*(column[tune_legged.LANES.index(name)] for column in walks))
+    return tune.Walks(*(column[tune.LANES.index(name)] for column in walks))
 
 
-@pytest.mark.parametrize("name", tune_legged.LANES)
+@pytest.mark.parametrize("name", tune.LANES)
 def test_walks_arrives_and_stands(walks, name):
     walk = lane(walks, name)
     assert walk.arrived

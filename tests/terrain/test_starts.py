@@ -6,8 +6,9 @@ import pytest
 from moonteam.cli import main
 from moonteam.problem.mission import Map, Mission, Robot, Target
 from moonteam.problem.mission import Site as MissionSite
+from moonteam.robots import KINDS
 from moonteam.terrain.site import for_mission
-from moonteam.terrain.traversability import boulder_distance, ground_under, limits_of
+from moonteam.terrain.traversability import boulder_distance, ground_under
 
 SIDE = 16
 TEXT = """
@@ -26,7 +27,7 @@ def cells():
     site = for_mission(mission)
     middle = np.arange(SIDE) - (SIDE - 1) / 2
     centres = np.stack(np.meshgrid(middle, middle), axis=-1)
-    away, limits = boulder_distance(site, centres), limits_of("wheeled")
+    away, limits = boulder_distance(site, centres), KINDS.get("wheeled").limits
     slope, _ = ground_under(site, centres, limits.footprint)
     assert away.min() < limits.footprint
     assert slope.max() > limits.max_slope

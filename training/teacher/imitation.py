@@ -34,7 +34,8 @@ from training.sharding import everywhere, mesh_for, spread
 TIE_BREAK = 0.05
 """Weight that makespan and moves both keep at either end of the preference."""
 
-KINDS = ("drone", "legged", "wheeled")
+KINDS = ("a", "b", "c")
+"""Labels of kinds on the grid, from the one that crosses everything on."""
 
 
 @dataclass(frozen=True)
@@ -145,15 +146,17 @@ class Learner(NamedTuple):
 def make_ground(family: Family, seed: int) -> Ground | None:
     """The family's maps with blocked cells, from a seed; None for open maps.
 
-    Drones cross everything; of the cells, legs are refused up to a fifth and wheels more.
+    The first kind crosses everything; the second is refused up to a fifth of the cells, the third
+    more.
     """
     if not family.grounds:
         return None
     rng = np.random.default_rng(seed)
     problems = []
     for _ in range(family.grounds):
-        legs = float(rng.uniform(0.02, 0.2))
-        blocked = {"drone": 0.0, "legged": legs, "wheeled": legs + float(rng.uniform(0.02, 0.15))}
+        some = float(rng.uniform(0.02, 0.2))
+        more = some + float(rng.uniform(0.02, 0.15))
+        blocked: dict[str, float] = dict(zip(KINDS, (0.0, some, more), strict=True))
         kinds = [KINDS[i % 3] for i in range(family.num_agents)]
         made = scenarios.generate(
             rng, num_agents=family.num_agents, num_targets=family.num_targets,

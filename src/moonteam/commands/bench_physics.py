@@ -72,7 +72,7 @@ def run(args: Args) -> int:
     from moonteam.physics.trials import speed
     from moonteam.report.tables import plain_markdown, print_as, save_plain
 
-    scene = speed.three_robots(args.site, args.seed, args.samples)
+    scene = speed.own_robots(args.site, args.seed, args.samples)
     rows = []
     for name, batch, threads in _loads(args):
         rows.append(speed.measure(scene, name, batch, args.seconds, threads))

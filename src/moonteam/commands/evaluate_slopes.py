@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from moonteam.commands.options import Reported
 from moonteam.errors import InputError
+
+if TYPE_CHECKING:
+    from moonteam.robots import RobotKind
 
 
 @dataclass(frozen=True)
 class Args(Reported):
     """Straight drives up, down and across planes of a known slope, smooth and rough.
 
-    Each drive is 13 m, 8 of them on the plane. A rover refuses a slope by standing still
+    Each drive is 13 m, 8 of them on the plane. A robot may refuse a slope by standing still
     before it, which counts as stuck. Means are over drives that arrived.
 
     Files in --out: slopes.json and table.md.
 
     Examples:
-      moonteam evaluate slopes --kind legged
-      moonteam evaluate slopes --kind wheeled --degrees 15 20 --roughness 0 --json
+      moonteam evaluate slopes --degrees 15 20 --roughness 0 --json
+      moonteam evaluate slopes --kind my_rover.py:ROVER --count 2
     """
 
-    kind: tuple[Literal["drone", "legged", "wheeled"], ...] = ("legged", "wheeled")
-    """which kinds of robot"""
+    kind: tuple[str, ...] = ()
+    """which kinds of robot, by name or FILE.py:OBJECT; default: all registered that do not fly"""
 
     degrees: tuple[float, ...] = (0.0, 12.0, 15.0, 20.0)
     """slopes of the plane"""
@@ -48,11 +51,12 @@ def run(args: Args) -> int:
     call_at_once()
     from moonteam.physics.trials.slopes import measure
     from moonteam.report import command, provenance, tables
-    from moonteam.robots import KINDS
 
-    rows = [row for kind in dict.fromkeys(args.kind) for roughness in args.roughness
+    args = replace(args, kind=tuple(dict.fromkeys(args.kind)) or _grounded())
+    kinds = _kinds(args.kind)
+    rows = [row for kind in kinds for roughness in args.roughness
             for degrees in args.degrees
-            for row in measure(KINDS[kind], degrees, roughness, args.count, args.seed)]
+            for row in measure(kind, degrees, roughness, args.count, args.seed)]
     meta = provenance.meta(command.line("evaluate slopes", args), args.seed)
     report = {"seed": args.seed, "rows": rows, "notes": NOTES, "meta": meta}
     shown = [([*COLUMNS], [_cells(row) for row in rows])]
@@ -61,6 +65,20 @@ def run(args: Args) -> int:
     tables.print_as(args, report, lambda: tables.plain_markdown(report, shown),
                     lambda: print(_table(rows)))
     return 0
+
+
+def _grounded() -> tuple[str, ...]:
+    """All registered kinds that do not fly."""
+    from moonteam.robots import KINDS
+
+    return tuple(name for name in KINDS.names() if not KINDS.get(name).flies)
+
+
+def _kinds(names: tuple[str, ...]) -> list[RobotKind]:
+    """Raises InputError for a kind that nobody knows."""
+    from moonteam.robots import KINDS
+
+    return [KINDS.get(name, "--kind") for name in names]
 
 
 def _check(args: Args) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import csv
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -18,6 +18,7 @@ from moonteam.report.command import Aside
 if TYPE_CHECKING:
     from moonteam.physics.trials.film import Shot
     from moonteam.physics.trials.traverse import Recording, Traverse
+    from moonteam.robots import RobotKind
 
 EXTENT = 26.0
 """Side of the sites beyond the length of a traverse, m."""
@@ -34,13 +35,13 @@ class Args(Reported):
     Files in --out: traverse.json, traverse.csv and table.md.
 
     Examples:
-      moonteam evaluate traverse --kind wheeled --site mare
+      moonteam evaluate traverse --kind my_rover.py:ROVER --site mare
       moonteam evaluate traverse --site highland --count 50 --out runs/traverse
       moonteam evaluate traverse --site crater_rim --count 20 --video --out runs/rim
     """
 
-    kind: tuple[Literal["drone", "legged", "wheeled"], ...] = ("drone", "legged", "wheeled")
-    """which kinds of robot"""
+    kind: tuple[str, ...] = ()
+    """which kinds of robot, by name or FILE.py:OBJECT; default: all registered"""
 
     site: str = "mare"
     """preset of the ground"""
@@ -79,9 +80,11 @@ def run(args: Args) -> int:
     call_at_once()
     from moonteam.physics.trials.traverse import summarise
     from moonteam.report import command, provenance, tables
+    from moonteam.robots import KINDS
 
+    args = replace(args, kind=tuple(dict.fromkeys(args.kind)) or KINDS.names())
     summaries, rows, stills = [], [], []
-    for kind in dict.fromkeys(args.kind):
+    for kind in [KINDS.get(name, "--kind") for name in args.kind]:
         mine, draws = _run_kind(args, kind, stills)
         summaries.append(summarise(mine) | {"route_draws": draws})
         rows += mine
@@ -107,7 +110,7 @@ def _seeds(args: Args) -> range:
     return range(args.seed, args.seed + min(args.sites, args.count))
 
 
-def _run_kind(args: Args, name: str, stills: list) -> tuple[list[Traverse], int]:
+def _run_kind(args: Args, kind: RobotKind, stills: list) -> tuple[list[Traverse], int]:
     """All traverses of one kind and how many routes were drawn for them.
 
     Films some if asked to and adds their pictures to `stills`.
@@ -116,7 +119,6 @@ def _run_kind(args: Args, name: str, stills: list) -> tuple[list[Traverse], int]
 
     from moonteam.physics.trials.film import choose
     from moonteam.physics.trials.traverse import draw_routes, run_traverses
-    from moonteam.robots import KINDS
     from moonteam.terrain.site import make_site
 
     places, total = [], 0
@@ -125,20 +127,20 @@ def _run_kind(args: Args, name: str, stills: list) -> tuple[list[Traverse], int]
         share = args.count // len(seeds) + (index < args.count % len(seeds))
         site = make_site(args.site, seed, args.length + EXTENT)
         rng = np.random.default_rng([args.seed, seed])
-        routes, draws = draw_routes(KINDS[name], site, share, args.length, rng)
+        routes, draws = draw_routes(kind, site, share, args.length, rng)
         places.append((site, routes))
         total += draws
     rows = []
     shots = choose(places) if args.video else []
     for place, (site, routes) in enumerate(places):
         mine = [shot for shot in shots if shot.place == place]
-        with _watched(f"{name} on {args.site} {site.seed}") as watch:
+        with _watched(f"{kind.name} on {args.site} {site.seed}") as watch:
             found, recordings = run_traverses(
-                KINDS[name], site, routes, backend=args.backend, watch=watch,
+                kind, site, routes, backend=args.backend, watch=watch,
                 record=[shot.route for shot in mine])
         rows += found
         for shot, recording in zip(mine, recordings, strict=True):
-            _film(args, name, shot, recording, stills)
+            _film(args, kind.name, shot, recording, stills)
     return rows, total
 
 

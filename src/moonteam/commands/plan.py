@@ -14,7 +14,7 @@ from moonteam import files, paths
 from moonteam.commands.options import Printed, Saved
 from moonteam.errors import InputError
 from moonteam.planners.base import Objective, Plan, Snapshot
-from moonteam.problem import mission, scenario
+from moonteam.problem import scenario
 from moonteam.problem.scenario import Scenario
 
 PlannerName = Literal["exact", "greedy", "lns", "cpsat", "exhaustive", "policy"]
@@ -110,7 +110,9 @@ def _named(found: Scenario) -> Case:
 
 
 def _mission_case(path: Path) -> Case:
-    found = mission.load(path)
+    from moonteam.robots import team
+
+    found, _ = team.load(path)
     return Case(found.scenario(), found.name or path.stem, tuple(r.name for r in found.robots),
                 tuple(found.target_name(j) for j in range(len(found.targets))))
 
@@ -235,8 +237,9 @@ def run(args: Args) -> int:
         print_plan(case, plan, args.alpha, args.beta)
     if args.out is not None:
         from moonteam.planners.plans.figure import draw_plan
+        from moonteam.robots import shades
 
         files.write_json(args.out / "plan.json", plan.document(), indent=0)
         draw_plan(args.out / "plan.png", case.scenario, plan, case.title, case.agents,
-                  case.targets)
+                  case.targets, shades(case.scenario.blocked or {}))
     return 1 if plan.status == "infeasible" else 0

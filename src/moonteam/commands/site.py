@@ -103,10 +103,12 @@ def _site(args: Args) -> Site:
 
 def _seconds(site: Site, cell_m: float) -> Maps:
     """kind -> [H, W] s to cross each cell, infinite where the kind cannot be."""
-    from moonteam.terrain.preview import KINDS, grid_of
+    from moonteam.robots import KINDS
+    from moonteam.terrain.preview import grid_of
     from moonteam.terrain.traversability import travel_times
 
-    return travel_times(site, grid_of(site, cell_m), cell_m, KINDS)
+    limits = {name: KINDS.get(name).limits for name in KINDS.names()}
+    return travel_times(site, grid_of(site, cell_m), cell_m, limits)
 
 
 def _summary(seconds: Maps) -> dict[str, Any]:

@@ -30,23 +30,28 @@ class Recipe:
     targets: int
     count: int
     skills: int = 2
-    blocked: dict[str, float] | None = None  # share of the map each kind cannot enter
+    ground: tuple[float, ...] | None = None  # share of the map each kind of ours cannot enter
     certified: bool = True  # optima by the exact planner; else best known and a bound
 
     def name(self) -> str:
         """File name without suffix, e.g. 3x5, 4x6-3skills, 3x6-blocked."""
         return (f"{self.agents}x{self.targets}" + (f"-{self.skills}skills" if self.skills != 2
-                else "") + ("-blocked" if self.blocked else ""))
+                else "") + ("-blocked" if self.ground else ""))
 
+    @property
+    def blocked(self) -> dict[str, float] | None:
+        """kind -> share of the map that it cannot enter."""
+        from moonteam.robots import OWN
 
-GROUND = {"drone": 0.0, "legged": 0.12, "wheeled": 0.25}
+        return dict(zip(OWN, self.ground, strict=True)) if self.ground else None
+
 
 RECIPES = (
     Recipe(3, 5, 1000), Recipe(3, 6, 1000), Recipe(3, 7, 1000),
     Recipe(2, 3, 200), Recipe(2, 8, 200), Recipe(3, 10, 200), Recipe(3, 12, 200),
     Recipe(4, 8, 200), Recipe(5, 5, 200), Recipe(5, 10, 200), Recipe(6, 12, 200),
     Recipe(4, 6, 200, skills=3), Recipe(5, 8, 200, skills=3),
-    Recipe(3, 6, 200, blocked=GROUND),
+    Recipe(3, 6, 200, ground=(0.0, 0.12, 0.25)),
     Recipe(5, 20, 100, certified=False), Recipe(8, 40, 100, certified=False),
 )
 NAMES = tuple(recipe.name() for recipe in RECIPES)

@@ -27,8 +27,8 @@ SIZES: tuple[dict[str, Any], ...] = (
     {"num_agents": 2, "num_targets": 4, "size": (16, 16)},
     {"num_agents": 3, "num_targets": 7},
     {"num_agents": 6, "num_targets": 12, "num_skills": 3},
-    {"num_agents": 3, "num_targets": 6, "size": (24, 24), "kinds": ["drone", "legged", "wheeled"],
-     "blocked": {"drone": 0.0, "legged": 0.15, "wheeled": 0.25}},
+    {"num_agents": 3, "num_targets": 6, "size": (24, 24), "kinds": ["a", "b", "c"],
+     "blocked": {"a": 0.0, "b": 0.15, "c": 0.25}},
 )
 """What a policy for any team is tried on; the last with blocked ground."""
 

@@ -76,7 +76,7 @@ def build_scene(
       placements: the robots, with names that differ.
       dt: physics step, s.
       iterations: most Newton iterations of the contact solver a step; mostly it takes one, but
-        a skidding wheel can need six, and cut short at four the rover drifted 4 cm in 5 s.
+        a skidding wheel can need six, and cut short at four a robot drifted 4 cm in 5 s.
       ls_iterations: line-search iterations within each.
       friction: sliding friction of ground and boulders.
 
@@ -87,7 +87,7 @@ def build_scene(
     check_starts(site, placements)
     spec = mujoco.MjSpec()
     _set_options(spec, dt, iterations, ls_iterations)
-    _bound_contacts(spec, len(placements))
+    _bound_contacts(spec, placements)
     _add_ground(spec, site, friction)
     for index, boulder in enumerate(site.boulders):
         _add_boulder(spec, index, boulder, friction)
@@ -184,14 +184,15 @@ def _set_options(spec: mujoco.MjSpec, dt: float, iterations: int, ls_iterations:
     spec.compiler.autolimits = True
 
 
-def _bound_contacts(spec: mujoco.MjSpec, robots: int) -> None:
+def _bound_contacts(spec: mujoco.MjSpec, placements: Sequence[Placement]) -> None:
     """Bounds MJX's work, which has a row for every contact that could ever be.
 
-    Kept are the nearest pairs where many boulders stand, and the deepest contacts: enough
-    for four feet or wheels a robot, each on two facets.
+    Kept are the nearest pairs where many boulders stand, and the deepest contacts: as many as
+    the kinds say.
     """
-    spec.add_numeric(name="max_geom_pairs", data=[4 + 4 * robots])
-    spec.add_numeric(name="max_contact_points", data=[8 * max(robots, 1)])
+    contacts = sum(placement.kind.contacts for placement in placements)
+    spec.add_numeric(name="max_geom_pairs", data=[4 + contacts // 2])
+    spec.add_numeric(name="max_contact_points", data=[max(contacts, 8)])
 
 
 def _add_ground(spec: mujoco.MjSpec, site: Site, friction: float) -> None:

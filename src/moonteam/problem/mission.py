@@ -1,6 +1,6 @@
 """What a user writes: robots, targets, map, site, events. YAML in, checked.
 
-Knows neither wing; both read it.
+Knows neither wing; both read it. Which kinds of robot there are is `moonteam.robots.team`'s to say.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from moonteam.errors import InputError
 from moonteam.problem import scenario
 from moonteam.problem.scenario import Cell
 
-KINDS = ("drone", "legged", "wheeled")
-Kind = Literal["drone", "legged", "wheeled"]
 WHAT = ("lost", "target", "slow", "silent", "impassable")
 """Keys of an event, one of which says what happens."""
 
@@ -38,10 +36,10 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One robot of a kind, with its skills and start cell."""
+    """One robot of a kind (a registered name, or FILE.py:OBJECT), with skills and start cell."""
 
     name: str
-    kind: Kind
+    kind: str
     skills: tuple[str, ...]
     start: Cell
 
@@ -72,7 +70,7 @@ class Silent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Impassable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The news that a kind of robot cannot cross a cell."""
 
-    kind: Kind
+    kind: str
     at: Cell
 
 

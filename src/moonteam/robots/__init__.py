@@ -1,10 +1,20 @@
-"""The three kinds of robot: model and controller each."""
+"""Kinds of robot: our own, those of installed packages, and those in a user's file."""
 
+from collections.abc import Iterable
+
+from moonteam.registry import Registry
 from moonteam.robots.base import RobotKind
-from moonteam.robots.drone import DRONE
-from moonteam.robots.legged import LEGGED
-from moonteam.robots.wheeled import WHEELED
 
-KINDS: dict[str, RobotKind] = {kind.name: kind for kind in (DRONE, LEGGED, WHEELED)}
+OWN = ("drone", "legged", "wheeled")
+"""The kinds of this package, which random teams are made of."""
 
-__all__ = ["KINDS"]
+KINDS = Registry("robot kind", "moonteam.robots", RobotKind, {
+    name: f"moonteam.robots.{name}:{name.upper()}" for name in OWN})
+
+__all__ = ["KINDS", "OWN", "RobotKind", "shades"]
+
+
+def shades(names: Iterable[str]) -> dict[str, str]:
+    """#rrggbb of ground closed to each of those kinds that are registered."""
+    known = KINDS.names()
+    return {name: KINDS.get(name).colour for name in names if name in known}

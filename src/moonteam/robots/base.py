@@ -1,4 +1,4 @@
-"""What the three kinds of robot share: one model and one controller each.
+"""What a kind of robot is: one object that answers whatever anybody asks about it.
 
 Controllers are pure JAX functions over a small typed state, so both backends and vmap use
 the same code. Units: SI, radians. World frame: x east, y north, z up, site centre at the
@@ -12,16 +12,24 @@ hulls, never the height field, whose cost in MJX grows with geom size), visual 0
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 
 from moonteam.terrain.surface import Surface
+from moonteam.terrain.traversability import Limits
+
+Floats = npt.NDArray[np.float64]
+Height = Callable[[Floats], Floats]  # ground height [...] m under points [..., 2] m
+Glyph = Literal["triangle", "disc", "square", "pentagon", "hexagon"]
+GLYPHS: tuple[Glyph, ...] = get_args(Glyph)
 
 GRAVITY = 1.62
 """Lunar gravity, m/s^2."""
@@ -36,8 +44,8 @@ CONTROL_PERIOD = 0.008
 class Command(NamedTuple):
     """Where a robot should go. Arrays so that it can be vmapped and traced."""
 
-    xy: Array  # [2] m, waypoint in the world frame; a drone holds its height above ground there
-    speed: Array  # [] m/s, upper limit; 0: hold the place; below 0: a drone lands at xy
+    xy: Array  # [2] m, waypoint in the world frame; what flies holds its height above ground there
+    speed: Array  # [] m/s, upper limit; 0: hold the place; below 0: what flies lands at xy
     lost: Array  # [] bool, True: actuators off (the robot left the team)
 
 
@@ -45,16 +53,40 @@ class Telemetry(NamedTuple):
     """What a controller reports each control step."""
 
     power: Array  # [] W, mechanical power asked of the actuators, >= 0
-    propellant: Array  # [] kg/s used; 0 for legged and wheeled
+    propellant: Array  # [] kg/s used; 0 where there is none
+
+
+class Camera(NamedTuple):
+    """How a film of one robot is taken."""
+
+    distance: float = 2.9  # m from the robot
+    seconds: float = 10.0  # of a clip
+
+
+CAMERA = Camera()
+
+
+class Tuning(NamedTuple):
+    """What `python -m moonteam.physics.trials.tune` may change, and the way to try it."""
+
+    numbers: Any  # NamedTuple of scalars: the controller's own
+    spans: Mapping[str, tuple[float, float]]  # limits of those that a search changes
+    control: Callable[..., tuple[Array, Any, Telemetry]]  # RobotKind.control, `numbers` first
 
 
 @dataclass(frozen=True)
 class RobotKind:
-    """One kind of robot, as the scene and the backends use it.
+    """One kind of robot: all that scene, backends, maps, films and reports ask about it.
 
     `init(qpos, qvel) -> state` and `control(state, time, qpos, qvel, command, surface) ->
     (ctrl [nu], state, Telemetry)`, all of this robot's own slices; called every
     CONTROL_PERIOD seconds. Pure, jittable, vmappable.
+
+    `odometry(qpos [T, 7 + joints], height) -> (counted, real) m`: what wheels or legs count
+    and how far the robot really went; None where that cannot be told. A kind without
+    `odometry` does not slip.
+
+    `moonteam.physics.trials.conformance` holds a kind to all this.
     """
 
     name: str
@@ -67,6 +99,23 @@ class RobotKind:
     max_slope: float  # rad, beyond which it must not go
     init: Callable[[Array, Array], Any]
     control: Callable[[Any, Array, Array, Array, Command, Surface], tuple[Array, Any, Telemetry]]
+    max_step: float = math.inf  # m, highest step it takes
+    slowing: float = 0.0  # share of its speed lost on max_slope; in proportion to the slope
+    flies: bool = False
+    fall_tilt: float = math.radians(60.0)  # rad of the base from the vertical: fallen
+    odometry: Callable[[Floats, Height | None], tuple[float, float] | None] | None = None
+    contacts: int = 8  # with ground and boulders that count at once: two a foot or wheel
+    callsign: str = ""  # of the one in a random team; "": its kind's name
+    glyph: Glyph = "disc"  # how a map marks it
+    colour: str = "#bfb8b0"  # #rrggbb, of ground that is closed to it
+    camera: Camera = CAMERA
+    tuning: Tuning | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """What ground it can cross, as maps ask for it."""
+        return Limits(self.footprint, self.max_slope, self.max_step, self.speed, self.slowing,
+                      self.flies)
 
 
 def times(matrix: Array, vector: Array) -> Array:
@@ -91,3 +140,25 @@ def quat_matrix(quat: Array) -> Array:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ])
+
+
+def rotations(quat: Floats) -> Floats:
+    """Rotation matrices [..., 3, 3], body to world, of quaternions [..., 4], on the host."""
+    w, x, y, z = np.moveaxis(quat / np.linalg.norm(quat, axis=-1, keepdims=True), -1, 0)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return np.stack(rows, axis=-1).reshape(*quat.shape[:-1], 3, 3)
+
+
+def wheel_odometry(qpos: Floats, joints: npt.NDArray[np.integer], radius: float
+                   ) -> tuple[float, float]:
+    """What wheels count and what the base really went, m; qpos [T, 7 + joints].
+
+    Counted is the mean turn of the wheel `joints` times their radius (so turning on the spot,
+    left against right, counts nothing), real the displacement along the heading.
+    """
+    turned = np.diff(qpos[:, 7 + joints], axis=0).mean(axis=1) * radius
+    forward = rotations(qpos[:, 3:7])[:, :, 0]
+    along = (np.diff(qpos[:, :3], axis=0) * (forward[1:] + forward[:-1]) / 2).sum(axis=1)
+    return float(np.abs(turned).sum()), float(np.abs(along).sum())

@@ -15,7 +15,15 @@ import numpy as np
 from jax import Array
 
 from moonteam.paths import assets
-from moonteam.robots.base import GRAVITY, Command, RobotKind, Telemetry, quat_matrix, times
+from moonteam.robots.base import (
+    GRAVITY,
+    Camera,
+    Command,
+    RobotKind,
+    Telemetry,
+    quat_matrix,
+    times,
+)
 from moonteam.robots.path import Offset, Path, braking_speed, measure, start_path, update_path
 from moonteam.terrain.surface import Surface
 
@@ -173,4 +181,5 @@ def _yaw(rotation: Array) -> Array:
 DRONE = RobotKind(
     name="drone", load=load, base="drone", spawn_height=STANDING_HEIGHT, home=np.zeros(0),
     speed=CRUISE_SPEED, footprint=0.3, max_slope=float(np.deg2rad(30.0)), init=init,
-    control=control)
+    control=control, flies=True, callsign="hopper", glyph="triangle",
+    camera=Camera(distance=4.2, seconds=16.0))  # from take-off to the goal

@@ -26,33 +26,29 @@ from moonteam.paths import assets
 from moonteam.robots.base import (
     CONTROL_PERIOD,
     GRAVITY,
+    Camera,
     Command,
     RobotKind,
     Telemetry,
+    Tuning,
     quat_matrix,
     times,
     turned,
 )
+from moonteam.robots.legs import END, FOOT_RADIUS, LINK, SIDE, leg_kinematics, odometry
 from moonteam.terrain.surface import Surface
 
 MASS = 15.0  # kg
 INERTIA = np.array([0.26, 0.53, 0.66])  # kg m^2, whole robot standing at home, about its axes
 CENTRE = np.array([-0.017, 0.0, -0.018])  # m, centre of mass in the base frame, likewise
-SIDE = np.array([1.0, -1.0, 1.0, -1.0])  # [L] +1 left, -1 right
-END = np.array([1.0, 1.0, -1.0, -1.0])  # [L] +1 front, -1 rear
-HIP_X, HIP_Y = 0.20, 0.10  # m, abduction axes from the base
-OFFSET = 0.07  # m, sideways from the abduction axis to the leg's plane
-LINK = 0.22  # m, thigh and shank
-FOOT_RADIUS = 0.03  # m
 TORQUE_LIMIT = 40.0  # N m
 FALLEN = np.cos(np.radians(70.0))  # the base's up axis below this: no torques
 
-HIPS = np.stack([END * HIP_X, SIDE * HIP_Y, np.zeros(4)], axis=1)  # [L, 3] m, base frame
 LEG_OFFSETS = np.array([0.0, 0.5, 0.5, 0.0])  # [L] share of the period: a trot
 
 
 class Gait(NamedTuple):
-    """Gait and gains: what the search in `tune_legged` tunes.
+    """Gait and gains: what `moonteam.physics.trials.tune` tunes.
 
     These come from eleven generations of `--search 12 --size 12 --seed 2`, begun at numbers
     set by hand (period 0.52, duty 0.6, height 0.27, velocity 10, attitude 190), rounded.
@@ -84,6 +80,16 @@ class Gait(NamedTuple):
 
 
 GAIT = Gait()
+
+SPANS = {
+    "period": (0.3, 0.7), "duty": (0.52, 0.8), "height": (0.24, 0.32), "stance": (0.15, 0.22),
+    "length": (0.17, 0.24), "clearance": (0.03, 0.10), "catch": (0.0, 0.25),
+    "lean": (-0.2, 0.3), "follow": (0.5, 1.0), "velocity": (3.0, 20.0), "push": (0.4, 1.2),
+    "lift": (30.0, 200.0), "lift_damping": (5.0, 30.0),
+    "attitude": (60.0, 400.0), "attitude_damping": (8.0, 40.0),
+    "swing": (20.0, 60.0), "moment": (0.005, 1.0), "friction": (0.4, 0.75),
+}  # fmt: skip
+"""What a search may change, and within which limits."""
 
 TURN_RATE = 0.7  # rad/s, most it turns
 ACCELERATION = 0.4  # m/s^2, most the wanted velocity changes
@@ -121,21 +127,6 @@ class _Body(NamedTuple):
     gradient: Array  # [2] fitted plane's rise in world x and y
     gap: Array  # [L] m, foot over the ground
     normal: Array  # [L, 3] ground's normal under each foot
-
-
-def leg_kinematics(angles: Array) -> tuple[Array, Array]:
-    """Feet [L, 3] m in the base frame and their Jacobians [L, 3, J] from angles [L, J] rad."""
-    roll, hip, knee = angles[:, 0], angles[:, 1], angles[:, 1] + angles[:, 2]
-    x = -LINK * (jnp.sin(hip) + jnp.sin(knee))
-    z = -LINK * (jnp.cos(hip) + jnp.cos(knee))
-    shank_x, shank_z = -LINK * jnp.sin(knee), -LINK * jnp.cos(knee)
-    y = jnp.asarray(SIDE * OFFSET, x.dtype)
-    cos, sin = jnp.cos(roll), jnp.sin(roll)
-    feet = jnp.stack([x, y * cos - z * sin, y * sin + z * cos], axis=1) + jnp.asarray(HIPS, x.dtype)
-    by_roll = jnp.stack([jnp.zeros_like(x), -y * sin - z * cos, y * cos - z * sin], axis=1)
-    by_hip = jnp.stack([z, x * sin, -x * cos], axis=1)
-    by_knee = jnp.stack([shank_z, shank_x * sin, -shank_x * cos], axis=1)
-    return feet, jnp.stack([by_roll, by_hip, by_knee], axis=2)
 
 
 def init(qpos: Array, qvel: Array) -> LeggedState:
@@ -400,4 +391,12 @@ LEGGED = RobotKind(
     max_slope=float(np.radians(20.0)),
     init=init,
     control=control,
+    max_step=0.16,  # half a leg's reach
+    slowing=0.3,  # from `moonteam evaluate slopes`
+    odometry=odometry,
+    callsign="strider",
+    glyph="disc",
+    colour="#a79b8e",
+    camera=Camera(distance=2.6, seconds=11.0),
+    tuning=Tuning(GAIT, SPANS, control_with),
 )

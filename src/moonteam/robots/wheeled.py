@@ -18,10 +18,14 @@ from moonteam.paths import assets
 from moonteam.robots.base import (
     CONTROL_PERIOD,
     GRAVITY,
+    Camera,
     Command,
+    Floats,
+    Height,
     RobotKind,
     Telemetry,
     quat_matrix,
+    wheel_odometry,
 )
 from moonteam.robots.path import Path, braking_speed, measure, start_path, update_path
 from moonteam.terrain.surface import Surface
@@ -191,7 +195,17 @@ def _wheel_speeds(speed: Array, turn: Array, rotation: Array, qvel: Array) -> Ar
     return jnp.clip(wanted, ground - slack, ground + slack) / WHEEL_RADIUS
 
 
+def odometry(qpos: Floats, height: Height | None) -> tuple[float, float]:
+    """What the wheels count and what the chassis really went, m; qpos [T, 13]."""
+    del height
+    return wheel_odometry(qpos, WHEELS, WHEEL_RADIUS)
+
+
 WHEELED = RobotKind(
     name="wheeled", load=load, base="chassis", spawn_height=STANDING_HEIGHT, home=np.zeros(6),
     speed=CRUISE_SPEED, footprint=FOOTPRINT, max_slope=MAX_SLOPE, init=init,
-    control=control)
+    control=control,
+    max_step=0.12,  # under a wheel's radius
+    slowing=0.05,  # from `moonteam evaluate slopes`
+    odometry=odometry, callsign="rover", glyph="square", colour="#c9bfb1",
+    camera=Camera(distance=2.9, seconds=10.0))

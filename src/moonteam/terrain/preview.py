@@ -15,8 +15,6 @@ from moonteam.terrain.traversability import FloatMap
 EDGE = 1.0
 """Ground kept free around the grid, m: no robot can stand on the very edge."""
 
-KINDS = ("drone", "legged", "wheeled")
-
 
 def draw_all(site: Site, folder: Path, cell_m: float, times: dict[str, FloatMap]) -> list[Path]:
     """Writes hillshade.png, slope.png, roughness.png and traversability.png; their paths.
@@ -79,8 +77,9 @@ def _draw_traversability(site: Site, path: Path, cell_m: float, times: dict[str,
                          ) -> Path:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.6, 4.6), layout="constrained")
-    for axes, kind in zip(figure.subplots(1, len(times)), times, strict=True):
+    figure = Figure(figsize=(4.2 * len(times), 4.6), layout="constrained")
+    places = figure.subplots(1, len(times), squeeze=False)[0]
+    for axes, kind in zip(places, times, strict=True):
         axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower",
                     extent=_box(site))
         seconds = times[kind]

@@ -11,7 +11,7 @@ Maps are indexed [y, x], row 0 in the south; the map's centre is the site's cent
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.problem.mission import Mission
-from moonteam.robots import KINDS
 from moonteam.terrain.site import Site
 from moonteam.terrain.surface import Surface
 
@@ -36,16 +35,6 @@ CLEARANCE = 0.1
 POINT_SPACING = 0.25
 """Between the points that a cell is judged on, m."""
 
-STEPS = {"drone": math.inf, "legged": 0.16, "wheeled": 0.12}
-"""Highest step each kind takes, m: half a leg's reach; under a wheel's radius."""
-
-SLOWING = {"drone": 0.0, "legged": 0.3, "wheeled": 0.05}
-"""Share of its speed that each kind loses on the steepest ground it may go; in proportion to the
-slope, from `moonteam evaluate slopes`."""
-
-FLYERS = frozenset({"drone"})
-
-
 @dataclass(frozen=True)
 class Limits:
     """What a kind can cross."""
@@ -58,32 +47,26 @@ class Limits:
     flies: bool
 
 
-def limits_of(kind: str) -> Limits:
-    """The limits of a kind of robot, from its model. Raises KeyError for an unknown kind."""
-    robot = KINDS[kind]
-    return Limits(robot.footprint, robot.max_slope, STEPS[kind], robot.speed, SLOWING[kind],
-                  kind in FLYERS)
-
-
-def passable_cells(site: Site, mission: Mission, kinds: Iterable[str]) -> dict[str, BoolMap]:
-    """kind -> [H, W]: the cells of the mission's map that the kind can be in."""
-    return traversability(site, mission.map.size, mission.map.cell_m, kinds)
+def passable_cells(site: Site, mission: Mission, limits: Mapping[str, Limits]
+                   ) -> dict[str, BoolMap]:
+    """kind -> [H, W]: the cells of the mission's map that a kind with these limits can be in."""
+    return traversability(site, mission.map.size, mission.map.cell_m, limits)
 
 
 def traversability(
-    site: Site, size: tuple[int, int], cell_m: float, kinds: Iterable[str]
+    site: Site, size: tuple[int, int], cell_m: float, limits: Mapping[str, Limits]
 ) -> dict[str, BoolMap]:
     """kind -> [H, W]: the cells of a map of `size` (W, H) that the kind can be in."""
-    times = travel_times(site, size, cell_m, kinds)
+    times = travel_times(site, size, cell_m, limits)
     return {kind: np.isfinite(seconds) for kind, seconds in times.items()}
 
 
 def travel_times(
-    site: Site, size: tuple[int, int], cell_m: float, kinds: Iterable[str]
+    site: Site, size: tuple[int, int], cell_m: float, limits: Mapping[str, Limits]
 ) -> dict[str, FloatMap]:
     """kind -> [H, W] s to cross each cell; infinite where the kind cannot be."""
     points = _cross_points(size, cell_m)  # [H, W, P, 2]
-    return {kind: _cell_seconds(site, points, cell_m, limits_of(kind)) for kind in kinds}
+    return {kind: _cell_seconds(site, points, cell_m, its) for kind, its in limits.items()}
 
 
 def passable(site: Site, xy: npt.NDArray[np.floating], limits: Limits) -> BoolMap:

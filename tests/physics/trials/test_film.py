@@ -1,6 +1,7 @@
 """Films: which traverses are chosen, a camera that nothing hides, files that hold pictures."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from moonteam.physics.scene import Placement, build_scene
 from moonteam.physics.trials import film
 from moonteam.physics.trials.traverse import Recording, Route
 from moonteam.robots import KINDS
+from moonteam.robots.base import Camera
 from moonteam.terrain.site import Boulder, Site
 
 
@@ -41,7 +43,7 @@ def test_the_largest_event_of_each_name_is_chosen():
 def test_the_camera_looks_over_walls():
     y, _ = np.mgrid[-60:61, -60:61] * 0.25
     walls = np.where(np.abs(y) > 1.4, 3.0, 0.0)  # a trench along x
-    scene = build_scene(site(walls), [Placement("robot", KINDS["wheeled"], (0.0, 0.0))])
+    scene = build_scene(site(walls), [Placement("robot", KINDS.get("wheeled"), (0.0, 0.0))])
     poses = np.tile(scene.qpos0, (100, 1))
     poses[:, 0] = np.linspace(-4, 4, 100)
     for camera in film._cameras(scene, poses, 4.0):
@@ -52,10 +54,10 @@ def test_the_camera_looks_over_walls():
         assert (line[:, 2] > np.asarray(scene.surface.top(line[:, :2].astype(np.float32)))).all()
 
 
-def test_a_film_and_its_contact_sheet(tmp_path, monkeypatch):
-    monkeypatch.setitem(film.CLIP_SECONDS, "drone", 0.48)
+def test_a_film_and_its_contact_sheet(tmp_path):
+    kind = replace(KINDS.get("drone"), camera=Camera(4.2, 0.48))
     place, route = site(), Route((0.0, 0.0), (3.0, 0.0), 0.0)
-    scene = build_scene(place, [Placement("robot", KINDS["drone"], route.start)])
+    scene = build_scene(place, [Placement("robot", kind, route.start)])
     poses = np.tile(scene.qpos0, (30, 1))
     poses[:, 0] = np.linspace(0, 3, 30)
     try:

@@ -31,7 +31,7 @@ def test_roughness_is_laid_over_it():
 
 
 def test_a_rover_is_reported_stuck_before_20_degrees():
-    rows = slopes.measure(KINDS["wheeled"], 20.0, 0.0, 1, 0)
+    rows = slopes.measure(KINDS.get("wheeled"), 20.0, 0.0, 1, 0)
     assert [row["way"] for row in rows] == ["up", "down", "across"]
     assert all(row["stuck"] == row["count"] == 1 for row in rows)
     # The plane begins at 2.5 m; that to be crossed tilts by and by from 0.5 to 4.5 m.

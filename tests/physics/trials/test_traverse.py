@@ -31,7 +31,7 @@ def log(xy, tilt=0.0):
 
 def judged(xy, tilt=0.0, diverged=False):
     route = traverse.Route((0.0, 0.0), (10.0, 0.0), 0.0)
-    judge = traverse._Judge(KINDS["wheeled"], site(), [route])
+    judge = traverse._Judge(KINDS.get("wheeled"), site(), [route])
     qpos, power, propellant, _ = log(np.asarray(xy, float), tilt)
     judge.add(qpos, power, propellant, np.array([diverged]))
     return judge.verdicts()[0]
@@ -76,7 +76,7 @@ def test_routes_keep_off_walls_and_boulders():
     heights[:, 60:] = 3.0  # a wall along x = 0
     rock = Boulder(np.array([-8.0, 0.0, 0.0]), 2.0, np.zeros((0, 3)))
     place = site(heights, [rock])
-    kind = KINDS["wheeled"]
+    kind = KINDS.get("wheeled")
     routes, draws = traverse.draw_routes(kind, place, 10, 8.0, np.random.default_rng(0))
     assert draws > 10
     for route in routes:
@@ -92,10 +92,10 @@ def test_impossible_routes_are_refused(monkeypatch):
     monkeypatch.setattr(traverse, "BATCHES", 1)
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match="too small"):
-        traverse.draw_routes(KINDS["drone"], site(), 1, 60.0, rng)
+        traverse.draw_routes(KINDS.get("drone"), site(), 1, 60.0, rng)
     steep = np.tile(np.arange(121) * 0.25 * np.tan(np.deg2rad(40.0)), (121, 1))
     with pytest.raises(InputError, match="only 0 of 1"):
-        traverse.draw_routes(KINDS["drone"], site(steep), 1, 5.0, rng)
+        traverse.draw_routes(KINDS.get("drone"), site(steep), 1, 5.0, rng)
 
 
 def test_command_prints_one_document_and_writes_files(capsys, tmp_path):

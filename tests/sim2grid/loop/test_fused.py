@@ -67,10 +67,10 @@ def test_the_fused_program_does_what_the_executor_does(prepared, backend):
             theirs.robot, theirs.goal_cell, theirs.ended)
     report = make_report(record, prepared.mission, prepared.frame, prepared.bases,
                          planner="first", objective=None, mode="barrier", backend="mjx", seed=0,
-                         grid_plan=None)
+                         grid_plan=None, kinds=prepared.kinds)
     theirs = make_report(told, prepared.mission, prepared.frame, prepared.bases,
                          planner="first", objective=None, mode="barrier", backend="mjx", seed=0,
-                         grid_plan=None)
+                         grid_plan=None, kinds=prepared.kinds)
     assert report.seconds == pytest.approx(theirs.seconds, abs=0.21)
     for ours, other in zip(report.robots, theirs.robots, strict=True):
         assert ours.distance_m == pytest.approx(other.distance_m, rel=0.05)

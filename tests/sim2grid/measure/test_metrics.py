@@ -4,8 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from moonteam.robots.legged import FOOT_RADIUS, HIP_X, LINK
-from moonteam.robots.wheeled import WHEEL_RADIUS, WHEELS
+from moonteam.robots.drone import DRONE
+from moonteam.robots.legged import LEGGED
+from moonteam.robots.legs import FOOT_RADIUS, HIP_X, LINK
+from moonteam.robots.wheeled import WHEEL_RADIUS, WHEELED, WHEELS
 from moonteam.terrain.surface import Surface
 from sim2grid.frame import Frame, tilt
 from sim2grid.loop.record import Decision, Leg, Loss, Record, Solve
@@ -58,7 +60,8 @@ def test_every_metric_of_a_known_trajectory(mission):
     spec, record = straight_then_back(mission)
     report = make_report(
         record, spec, Frame((3, 1), 2.0), [0], planner="exact", objective="makespan",
-        mode="barrier", backend="native", seed=3, grid_plan=GridPlan(True, 2, 2))
+        mode="barrier", backend="native", seed=3, grid_plan=GridPlan(True, 2, 2),
+        kinds={"wheeled": WHEELED})
     assert (report.success, report.cause, report.detail) == (False, "unsolvable", "far")
     assert (report.seconds, report.decisions, report.moves) == (10.0, 2, 2)
     assert report.inflation is None, "a failed mission has none"
@@ -127,14 +130,14 @@ def rover(x, turned, heading=0.0):
 def test_slip_of_wheels_from_none_to_all_either_way():
     x = np.linspace(0.0, 2.0, 21)
     for heading in (0.0, 2.0):
-        assert slip("wheeled", rover(x, x / WHEEL_RADIUS, heading)) == pytest.approx(0.0, abs=1e-9)
-    assert slip("wheeled", rover(-x, -x / WHEEL_RADIUS)) == pytest.approx(0.0), "backwards too"
-    assert slip("wheeled", rover(0 * x, x / WHEEL_RADIUS)) == 1.0, "spins on the spot"
-    assert slip("wheeled", rover(x, 0 * x)) == -1.0, "slides with its wheels braked"
-    assert slip("wheeled", rover(0 * x, 0 * x)) is None, "never moved"
+        assert slip(WHEELED, rover(x, x / WHEEL_RADIUS, heading)) == pytest.approx(0.0, abs=1e-9)
+    assert slip(WHEELED, rover(-x, -x / WHEEL_RADIUS)) == pytest.approx(0.0), "backwards too"
+    assert slip(WHEELED, rover(0 * x, x / WHEEL_RADIUS)) == 1.0, "spins on the spot"
+    assert slip(WHEELED, rover(x, 0 * x)) == -1.0, "slides with its wheels braked"
+    assert slip(WHEELED, rover(0 * x, 0 * x)) is None, "never moved"
     left_against_right = np.outer(x / WHEEL_RADIUS, [1.0, 1.0, -1.0, -1.0])
-    assert slip("wheeled", rover(0 * x, left_against_right)) is None, "turning is not slipping"
-    assert slip("drone", rover(x, x)[:, :7]) is None
+    assert slip(WHEELED, rover(0 * x, left_against_right)) is None, "turning is not slipping"
+    assert slip(DRONE, rover(x, x)[:, :7]) is None
 
 
 def pendulum(share, height=0.0):
@@ -150,14 +153,14 @@ def pendulum(share, height=0.0):
 
 
 def test_slip_of_feet_that_hold_slide_or_do_not_touch():
-    assert slip("legged", pendulum(1.0), flat) == pytest.approx(0.0, abs=1e-4)
-    assert slip("legged", pendulum(0.8), flat) == pytest.approx(0.2, abs=1e-4)
-    assert slip("legged", pendulum(0.0), flat) == pytest.approx(1.0)
-    assert slip("legged", pendulum(1.0, height=0.01), flat) is None, "no foot touches"
-    assert slip("legged", pendulum(1.0)) is None, "nobody knows the ground"
+    assert slip(LEGGED, pendulum(1.0), flat) == pytest.approx(0.0, abs=1e-4)
+    assert slip(LEGGED, pendulum(0.8), flat) == pytest.approx(0.2, abs=1e-4)
+    assert slip(LEGGED, pendulum(0.0), flat) == pytest.approx(1.0)
+    assert slip(LEGGED, pendulum(1.0, height=0.01), flat) is None, "no foot touches"
+    assert slip(LEGGED, pendulum(1.0)) is None, "nobody knows the ground"
     sledge = pendulum(1.0)[[20] * 41]
     sledge[:, 0] = np.linspace(0.0, HIP_X, 41)
-    assert slip("legged", sledge, flat) == pytest.approx(-1.0)
+    assert slip(LEGGED, sledge, flat) == pytest.approx(-1.0)
 
 
 def test_the_ground_under_feet_is_the_surface_of_the_physics():

@@ -63,7 +63,7 @@ def test_the_map_puts_north_up_and_colours_targets_by_state(mission):
     spec = mission(["a drone A 0 0"], ["A OR 3 3", "A OR 0 3"])
     picture = MapPicture(Frame((4, 4), 1.0), Ground(np.zeros((17, 17)), 0.25), 400)
     marks = [TargetMark("far", spec.targets[0], True), TargetMark("near", spec.targets[1], False)]
-    robots = [RobotMark("a", "drone", np.array([[-1.5, -1.5]]))]
+    robots = [RobotMark("a", "triangle", np.array([[-1.5, -1.5]]))]
     image = np.asarray(picture.draw(robots, marks, labels=False)).astype(int)
     top_right, top_left = image[:100, 300:], image[:100, :100]
     assert (top_right[..., 1] - top_right[..., 0]).max() > 100, "green: solved"

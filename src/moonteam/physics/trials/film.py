@@ -30,10 +30,8 @@ EVENTS = ("rim", "boulders", "slope")
 STATION = 0.25  # m between the points that a route is judged on
 STRETCH = 2.0  # m over which a slope is taken
 RIM = 2.5  # m: a rim is as high as its crest stands over the ground this far before and behind
-CLIP_SECONDS = {"drone": 16.0, "legged": 11.0, "wheeled": 10.0}  # a drone's: take-off to goal
 EVERY = 2  # poses a frame: 12.5 frames a second
 SHADOW_REACH = 7.0  # m around the robot
-DISTANCE = {"drone": 4.2, "legged": 2.6, "wheeled": 2.9}  # m, camera from the robot
 RIM_DISTANCE = 1.4  # times as far, so that the rim is seen as one
 LOWEST, HIGHEST = 12.0, 75.0  # degrees, camera above the horizon
 VIEWS = (-125.0, -55.0, 55.0, 125.0)  # degrees, from the heading to where the camera looks
@@ -110,7 +108,7 @@ def film(recording: Recording, path: Path, *, event: str = "", along: float | No
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     first, last = _clip(recording, along)
     shown = poses[first:last:EVERY]
-    distance, views = DISTANCE[scene.robots[0].kind.name], VIEWS
+    distance, views = scene.robots[0].kind.camera.distance, VIEWS
     if event == "rim":
         distance, views = RIM_DISTANCE * distance, RIM_VIEWS
     markers, cameras = _markers(scene, route), _cameras(scene, shown, distance, views)
@@ -152,7 +150,7 @@ def contact_sheet(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], path: Path,
 def _clip(recording: Recording, along: float | None) -> tuple[int, int]:
     """First and past-the-last pose of a film."""
     scene, route, poses = recording
-    count = round(CLIP_SECONDS[scene.robots[0].kind.name] / SAMPLE_SECONDS)
+    count = round(scene.robots[0].kind.camera.seconds / SAMPLE_SECONDS)
     if along is None or len(poses) <= count:
         return 0, min(count, len(poses))
     way = np.array(route.goal) - route.start
@@ -180,7 +178,7 @@ def _cameras(scene: Scene, poses: Floats, distance: float, views: Sequence[float
              ) -> list[mujoco.MjvCamera]:
     """A camera for each pose [T, nq]: from the side, sun behind it, nothing in the way."""
     aim = _smooth(poses[:, :3].astype(np.float64), 0.6, FRAME_SECONDS)
-    if scene.robots[0].kind.name == "drone":
+    if scene.robots[0].kind.flies:
         aim[:, 2] -= 0.5  # its shadow shows how high it is
     way = aim[-1, :2] - aim[0, :2]
     heading = math.degrees(math.atan2(way[1], way[0]))
@@ -241,7 +239,7 @@ def _words(scene: Scene, event: str, seconds: float, pose: Floats, speed: float,
     lines = [f"{kind.name}, {event}: {site.name} {site.seed}",
              f"{seconds:4.1f} s  {speed:.2f} m/s  {rise:+.2f} m",
              f"ground {slope:2.0f} deg  tilt {tilt:2.0f} deg"]
-    if kind.name == "drone":
+    if kind.flies:
         feet = float(pose[2]) - kind.spawn_height - float(scene.surface.height(at))
         lines.append(f"feet {max(0.0, feet):.1f} m above the ground")
     return "\n".join(lines)

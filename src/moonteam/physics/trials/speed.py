@@ -20,7 +20,7 @@ from jax import Array
 
 from moonteam.physics.backends import Backend, Commands, NativeBackend, hold, make_backend
 from moonteam.physics.scene import Placement, Scene, build_scene
-from moonteam.robots import KINDS
+from moonteam.robots import KINDS, OWN
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind, Telemetry
 from moonteam.terrain.site import make_site
 from moonteam.terrain.surface import Surface
@@ -29,11 +29,11 @@ SPREAD = 3.0
 """Distance between robots at the start, m."""
 
 
-def three_robots(preset: str, seed: int, samples: int) -> Scene:
-    """One robot of each kind on a site of samples x samples at 0.25 m."""
+def own_robots(preset: str, seed: int, samples: int) -> Scene:
+    """One robot of each kind of ours on a site of samples x samples at 0.25 m."""
     site = make_site(preset, seed, (samples - 1) * 0.25)
-    return build_scene(site, [Placement(name, kind, (SPREAD * (i - 1), 0.0))
-                              for i, (name, kind) in enumerate(KINDS.items())])
+    return build_scene(site, [Placement(name, KINDS.get(name), (SPREAD * (i - 1), 0.0))
+                              for i, name in enumerate(OWN)])
 
 
 def drive(scene: Scene, batch: int, way: float = 1.0) -> Commands:

@@ -21,10 +21,10 @@ from moonteam.physics.backends import make_backend
 from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
 from moonteam.terrain.site import Site
-from moonteam.terrain.traversability import POINT_SPACING, STRAY, limits_of, passable
+from moonteam.terrain.traversability import POINT_SPACING, STRAY, passable
 
 ARRIVAL = 0.25  # m from the goal: what the executor calls arrived on cells of 1 m
-FALLEN_TILT, FALLEN_SECONDS = math.radians(60.0), 2.0
+FALLEN_SECONDS = 2.0  # that long over the kind's fall tilt
 STUCK_PROGRESS, STUCK_SECONDS = 0.3, 20.0  # less than that far in that long
 REST_SECONDS = 3.0  # still watched after the arrival, to see where it comes to rest
 PATIENCE = 4.0  # times the time at the kind's own speed
@@ -110,7 +110,7 @@ def _passable(kind: RobotKind, site: Site, start: np.ndarray, goal: np.ndarray) 
 
     The robot may stray to either side, and it must be able to stand at both ends.
     """
-    limits = limits_of(kind.name)
+    limits = kind.limits
     way = goal - start
     length = float(np.linalg.norm(way[0]))
     aside = STRAY / length * np.stack([-way[:, 1], way[:, 0]], axis=1)
@@ -209,7 +209,7 @@ class _Judge:
         if near.size:
             return "arrived", int(near[0]) + 1
         fallen = round(FALLEN_SECONDS / SAMPLE_SECONDS)
-        if len(tilt) >= fallen and (tilt[-fallen:] > FALLEN_TILT).all():
+        if len(tilt) >= fallen and (tilt[-fallen:] > self._kind.fall_tilt).all():
             return "fallen", len(xy)
         stuck = round(STUCK_SECONDS / SAMPLE_SECONDS)
         if len(xy) > stuck and np.linalg.norm(xy[-1] - xy[-1 - stuck]) < STUCK_PROGRESS:

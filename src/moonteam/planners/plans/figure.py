@@ -6,7 +6,7 @@ Cells are (x, y), x right, y up, origin lower left.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,17 @@ from moonteam.problem.scenario import Scenario
 COLOURS = ("#d1495b", "#00798c", "#edae49", "#5f4b8b", "#3b8b3b", "#c05a1c", "#3d5a80",
            "#b5508e", "#7a6f3a", "#4a4e69")
 INK, PAPER, GROUND = "#22223b", "#fbfaf7", "#eeece6"
-SHADE = {"*": "#55555f", "legged": "#a79b8e", "wheeled": "#c9bfb1"}
+SHADE, FOR_ALL = "#bfb8b0", "#55555f"  # of ground closed to a kind, and to every kind
 
 
 def draw_plan(path: str | Path, scenario: Scenario, plan: Plan, title: str,
-              agents: Sequence[str], targets: Sequence[str]) -> None:
-    """Draws the plan as a PNG; an infeasible one shows the map alone and says why."""
+              agents: Sequence[str], targets: Sequence[str],
+              shades: Mapping[str, str] | None = None) -> None:
+    """Draws the plan as a PNG; an infeasible one shows the map alone and says why.
+
+    `shades`: kind -> #rrggbb of the ground that is closed to it.
+    """
+    shades = {"*": FOR_ALL} | dict(shades or {})
     width, height = scenario.size
     scale = 8.2 / max(width, height)
     figure = Figure(figsize=(max(5.0, width * scale) + 2.6, max(4.0, height * scale) + 1.0),
@@ -36,13 +41,13 @@ def draw_plan(path: str | Path, scenario: Scenario, plan: Plan, title: str,
     with matplotlib.rc_context({"font.family": "DejaVu Sans"}):
         map_axes, side = figure.subplots(
             1, 2, gridspec_kw={"width_ratios": [max(5.0, width * scale), 2.4]})
-        _ground(map_axes, scenario)
+        _ground(map_axes, scenario, shades)
         cells = replay(Snapshot.start(scenario), plan.actions).cells
         size = float(np.clip(9.5 * 32 / max(width, height), 5.5, 12.0))
         _paths(map_axes, cells, len(agents), scale)
         _targets(map_axes, scenario, plan, targets, size)
         _starts(map_axes, scenario, size)
-        _sidebar(side, scenario, plan, agents, targets)
+        _sidebar(side, scenario, plan, agents, targets, shades)
         figure.suptitle(f"{title}: {plan.planner}, {_headline(plan)}", color=INK, fontsize=13,
                         fontweight="bold", x=0.02, ha="left")
         with files.replacing(path) as temporary:
@@ -55,14 +60,14 @@ def _headline(plan: Plan) -> str:
     return f"{plan.objective}, {plan.status}: makespan {plan.makespan}, moves {plan.moves}"
 
 
-def _ground(axes: Any, scenario: Scenario) -> None:
+def _ground(axes: Any, scenario: Scenario, shades: Mapping[str, str]) -> None:
     """The map with its grid and the cells that some kinds cannot enter."""
     width, height = scenario.size
     axes.set_facecolor(GROUND)
     for kind in sorted(scenario.blocked or {}, key=lambda k: -len((scenario.blocked or {})[k])):
         for x, y in (scenario.blocked or {})[kind]:
             axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, linewidth=0,
-                                     color=_shade(kind)))
+                                     color=shades.get(kind, SHADE)))
     if max(width, height) <= 64:
         axes.set_xticks(np.arange(-0.5, width), minor=True)
         axes.set_yticks(np.arange(-0.5, height), minor=True)
@@ -74,10 +79,6 @@ def _ground(axes: Any, scenario: Scenario) -> None:
     for spine in axes.spines.values():
         spine.set_color("#c9c5bb")
     axes.set_axisbelow(True)
-
-
-def _shade(kind: str) -> str:
-    return SHADE.get(kind, "#bfb8b0")
 
 
 def _paths(axes: Any, cells: IntArray, agents: int, scale: float) -> None:
@@ -147,7 +148,7 @@ def _starts(axes: Any, scenario: Scenario, size: float) -> None:
 
 
 def _sidebar(axes: Any, scenario: Scenario, plan: Plan, agents: Sequence[str],
-             targets: Sequence[str]) -> None:
+             targets: Sequence[str], shades: Mapping[str, str]) -> None:
     """Each agent's visits in order, or the reason why there is no plan."""
     axes.set_axis_off()
     axes.set_xlim(0, 1)
@@ -177,5 +178,5 @@ def _sidebar(axes: Any, scenario: Scenario, plan: Plan, agents: Sequence[str],
     closed = [kind for kind, cells in (scenario.blocked or {}).items() if cells]
     for i, kind in enumerate(closed):
         axes.text(0.0, 0.09 + 0.022 * i, f"\u25a0 closed to {kind if kind != '*' else 'all'}",
-                  color=_shade(kind), fontsize=9, va="bottom", transform=axes.transAxes)
+                  color=shades.get(kind, SHADE), fontsize=9, va="bottom", transform=axes.transAxes)
     axes.text(0.0, 0.0, note, color="#6b6b78", fontsize=8, va="bottom", transform=axes.transAxes)

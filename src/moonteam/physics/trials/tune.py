@@ -1,12 +1,12 @@
-"""Tunes and measures the quadruped's gait in C MuJoCo.
+"""Tunes and measures a controller whose kind says what may be tuned, in C MuJoCo.
 
-    python -m moonteam.robots.tune_legged --search 40      (prints the best gait found)
-    python -m moonteam.robots.tune_legged --evaluate       (prints JSON: falls, speed, tilt)
+    python -m moonteam.physics.trials.tune KIND --search 40      (prints the best numbers found)
+    python -m moonteam.physics.trials.tune KIND --evaluate       (prints JSON: falls, speed, tilt)
 
-The search is a cross-entropy method: sample gaits around a mean, let each walk every lane of
-an obstacle course, move mean and spread to the best quarter.
+The search is a cross-entropy method: sample the numbers around a mean, let each sample walk
+every lane of an obstacle course, move mean and spread to the best quarter.
 
-Letters: B worlds (walks), G gaits sampled, N lanes.
+Letters: B worlds (walks), N lanes, J joints, K numbers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import argparse
 import json
 import math
 import sys
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,30 +25,21 @@ import numpy as np
 from mujoco.batch import Batch
 
 from moonteam.compilation import enable_cache
+from moonteam.errors import InputError
 from moonteam.physics.scene import FRICTION, Placement, Scene, build_scene, start_pose
-from moonteam.robots.base import CONTROL_PERIOD, PHYSICS_DT, Command
-from moonteam.robots.legged import GAIT, LEGGED, Gait, LeggedState, control_with
+from moonteam.robots import KINDS, RobotKind
+from moonteam.robots.base import CONTROL_PERIOD, PHYSICS_DT, Command, Tuning
 from moonteam.terrain.site import SPACING, Site, make_site, rough_ground
+from moonteam.terrain.surface import Surface
 
-FALLEN = math.cos(math.radians(60.0))
 ARRIVED = 0.15  # m from the goal
+SPEED = 0.5  # m/s asked for
 SUBSTEPS = round(CONTROL_PERIOD / PHYSICS_DT)
 
 LANES = ("flat", "rough", "very rough", "up 12", "up 20", "down 12", "down 20", "across 15",
          "craters")  # fmt: skip
 LANE_WIDTH = 5.0  # m
 LANE_LENGTH = 24.0  # m
-
-SPANS: dict[str, tuple[float, float]] = {
-    "period": (0.3, 0.7), "duty": (0.52, 0.8), "height": (0.24, 0.32), "stance": (0.15, 0.22),
-    "length": (0.17, 0.24), "clearance": (0.03, 0.10), "catch": (0.0, 0.25),
-    "lean": (-0.2, 0.3), "follow": (0.5, 1.0), "velocity": (3.0, 20.0), "push": (0.4, 1.2),
-    "lift": (30.0, 200.0), "lift_damping": (5.0, 30.0),
-    "attitude": (60.0, 400.0), "attitude_damping": (8.0, 40.0),
-    "swing": (20.0, 60.0), "moment": (0.005, 1.0), "friction": (0.4, 0.75),
-}  # fmt: skip
-"""What the search may change, and within which limits."""
-
 
 class Walks(NamedTuple):
     """What came of B walks."""
@@ -64,11 +57,18 @@ class Walks(NamedTuple):
     rest: np.ndarray  # [B] m/s, speed at the end
 
 
+def tuning_of(kind: RobotKind) -> Tuning:
+    """What the kind lets a search change. Raises InputError if that is nothing."""
+    if kind.tuning is None:
+        raise InputError(kind.name, "has no numbers to tune: its kind says no `tuning`")
+    return kind.tuning
+
+
 def walk(
-    scene: Scene, starts: np.ndarray, goals: np.ndarray, seconds: float, gaits: Gait = GAIT,
-    threads: int = 1,
+    kind: RobotKind, scene: Scene, starts: np.ndarray, goals: np.ndarray, seconds: float,
+    numbers: Any = None, threads: int = 1,
 ) -> Walks:
-    """Walks from starts [B, 7+J] (qpos) to goals [B, 2] m; gait leaves [B] or scalars.
+    """Walks from starts [B, 7+J] (qpos) to goals [B, 2] m; leaves of `numbers` [B] or scalars.
 
     A walk ends three seconds after it arrives, so that `rest` tells whether the robot stands.
     """  # fmt: skip
@@ -77,11 +77,14 @@ def walk(
     qpos, qvel, ctrl = (worlds.bind(name) for name in ("qpos", "qvel", "ctrl"))
     qpos[:] = starts
     held = jnp.asarray(starts, jnp.float32)
-    states = jax.vmap(LEGGED.init)(held, jnp.zeros((size, scene.model.nv)))
-    gaits = Gait(*(jnp.broadcast_to(jnp.asarray(x, jnp.float32), (size,)) for x in gaits))
+    states = jax.vmap(kind.init)(held, jnp.zeros((size, scene.model.nv)))
+    numbers = tuning_of(kind).numbers if numbers is None else numbers
+    numbers = jax.tree.map(
+        lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (size,)), numbers)
     commands = Command(
-        jnp.asarray(goals, jnp.float32), jnp.full(size, 0.5), jnp.zeros(size, bool)
+        jnp.asarray(goals, jnp.float32), jnp.full(size, SPEED), jnp.zeros(size, bool)
     )
+    control, upright_least = _control(tuning_of(kind).control), math.cos(kind.fall_tilt)
     way = goals - starts[:, :2]
     path = np.linalg.norm(way, axis=1)
     across = np.stack([-way[:, 1], way[:, 0]], axis=1) / np.maximum(path, 1e-9)[:, None]
@@ -93,8 +96,8 @@ def walk(
         running = ~fallen & (spare > 0.0) & (arrived | (step * CONTROL_PERIOD < seconds))
         if not running.any():
             break
-        asked, states, power = _CONTROL(
-            gaits, states, qpos.astype(np.float32), qvel.astype(np.float32), commands,
+        asked, states, power = control(
+            numbers, states, qpos.astype(np.float32), qvel.astype(np.float32), commands,
             scene.surface,
         )  # fmt: skip
         ctrl[:] = asked
@@ -102,7 +105,7 @@ def walk(
         upright = 1.0 - 2.0 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2)
         left = np.linalg.norm(goals - qpos[:, :2], axis=1)
         now = (step + 1) * CONTROL_PERIOD
-        fell = running & ~(upright > FALLEN)
+        fell = running & ~(upright > upright_least)
         there = running & ~fell & ~arrived & (left < ARRIVED)
         ended = np.where((fell & ~arrived) | there, now, ended)
         fallen, arrived = fallen | fell, arrived | there
@@ -121,15 +124,16 @@ def walk(
     )  # fmt: skip
 
 
-def _control(
-    gait: Gait, state: LeggedState, qpos: jax.Array, qvel: jax.Array, command: Command,
-    surface: object,
-) -> tuple[jax.Array, LeggedState, jax.Array]:  # fmt: skip
-    asked, state, told = control_with(gait, state, jnp.zeros(()), qpos, qvel, command, surface)  # pyright: ignore[reportArgumentType]
-    return asked, state, told.power
+@cache
+def _control(control: Callable[..., Any]) -> Callable[..., Any]:
+    """B controllers at once; returns ctrl [B, nu], states, power [B] W."""
 
+    def one(numbers: Any, state: Any, qpos: jax.Array, qvel: jax.Array, command: Command,
+            surface: Surface) -> tuple[jax.Array, Any, jax.Array]:
+        asked, state, told = control(numbers, state, jnp.zeros(()), qpos, qvel, command, surface)
+        return asked, state, told.power
 
-_CONTROL = jax.jit(jax.vmap(_control, in_axes=(0, 0, 0, 0, 0, None)))
+    return jax.jit(jax.vmap(one, in_axes=(0, 0, 0, 0, 0, None)))
 
 
 def site_of(heights: np.ndarray, name: str, spacing: float = SPACING) -> Site:
@@ -167,12 +171,12 @@ def course(seed: int) -> Site:
     return site_of(heights, "course")
 
 
-def lanes(site: Site) -> tuple[np.ndarray, np.ndarray]:
-    """Starts [N, 19] (qpos) and goals [N, 2] m of the lanes, each 9 m apart."""
+def lanes(kind: RobotKind, site: Site) -> tuple[np.ndarray, np.ndarray]:
+    """Starts [N, 7 + J] (qpos) and goals [N, 2] m of the lanes, each 9 m apart."""
     middles = (np.arange(len(LANES)) + 0.5 - len(LANES) / 2) * LANE_WIDTH
     yaws = {"rough": 2.8, "across 15": -1.5}  # the others face their goal
     starts = [
-        start_pose(site, Placement("r", LEGGED, (-4.5, y), yaws.get(name, 0.0)))
+        start_pose(site, Placement("r", kind, (-4.5, y), yaws.get(name, 0.0)))
         for name, y in zip(LANES, middles, strict=True)
     ]
     return np.array(starts), np.stack([np.full(len(LANES), 4.5), middles], axis=1)
@@ -189,24 +193,26 @@ def score(walks: Walks) -> np.ndarray:
     )  # fmt: skip
 
 
-def search(generations: int, size: int, seed: int) -> Gait:
-    """The best mean gait after so many generations of `size` gaits."""
-    names = list(SPANS)
-    low, high = (np.array([SPANS[n][k] for n in names]) for k in (0, 1))
-    mean = (np.array([float(getattr(GAIT, n)) for n in names]) - low) / (high - low)
+def search(kind: RobotKind, generations: int, size: int, seed: int) -> Any:
+    """The best mean numbers after so many generations of `size` samples."""
+    begun, spans, _ = tuning_of(kind)
+    names = list(spans)
+    low, high = (np.array([spans[n][k] for n in names]) for k in (0, 1))
+    mean = (np.array([float(getattr(begun, n)) for n in names]) - low) / (high - low)
     spread = np.full(len(names), 0.1)
     rng = np.random.default_rng(seed)
     for generation in range(generations):
         site = course(seed * 1000 + generation)
-        scene = build_scene(site, [Placement("r", LEGGED, (-4.5, 0.0))])
-        starts, goals = lanes(site)
+        scene = build_scene(site, [Placement("r", kind, (-4.5, 0.0))])
+        starts, goals = lanes(kind, site)
         draws = np.clip(mean + spread * rng.standard_normal((size, len(names))), 0.0, 1.0)
         draws[0] = mean
         values = low + draws * (high - low)
-        gaits = GAIT._replace(**{
+        numbers = begun._replace(**{
             n: np.repeat(values[:, k], len(starts)) for k, n in enumerate(names)
         })  # fmt: skip
-        walks = walk(scene, np.tile(starts, (size, 1)), np.tile(goals, (size, 1)), 28.0, gaits)
+        walks = walk(kind, scene, np.tile(starts, (size, 1)), np.tile(goals, (size, 1)), 28.0,
+                     numbers)
         scores = score(walks).reshape(size, -1)
         best = draws[np.argsort(-scores.mean(axis=1))[: size // 4]]
         mean = 0.4 * mean + 0.6 * best.mean(axis=0)
@@ -217,13 +223,14 @@ def search(generations: int, size: int, seed: int) -> Gait:
             json.dumps({"generation": generation, "mean": round(float(scores[0].mean()), 3),
                         "best": round(float(scores.mean(axis=1).max()), 3),
                         "arrived": round(float(walks.arrived.mean()), 3),
-                        "falls": lane_falls, "gait": found}),
+                        "falls": lane_falls, "numbers": found}),
             file=sys.stderr, flush=True,
         )  # fmt: skip
-    return GAIT._replace(**dict(zip(names, (low + mean * (high - low)).tolist(), strict=True)))
+    return begun._replace(**dict(zip(names, (low + mean * (high - low)).tolist(), strict=True)))
 
 
-def traverses(site: Site, count: int, length: float, rng: np.random.Generator) -> np.ndarray:
+def traverses(kind: RobotKind, site: Site, count: int, length: float, rng: np.random.Generator
+              ) -> np.ndarray:
     """Ends [count, 4] m of straight walks over ground that the robot may cross."""
     found: list[np.ndarray] = []
     half = np.array(site.extent) - 1.0
@@ -232,28 +239,28 @@ def traverses(site: Site, count: int, length: float, rng: np.random.Generator) -
             break
         start, turn = rng.uniform(-half, half), rng.uniform(0, 2 * math.pi)
         goal = start + length * np.array([math.cos(turn), math.sin(turn)])
-        if (np.abs(goal) < half).all() and _free(site, start, goal):
+        if (np.abs(goal) < half).all() and _free(kind, site, start, goal):
             found.append(np.concatenate([start, goal]))
     return np.array(found)
 
 
-def _free(site: Site, start: np.ndarray, goal: np.ndarray) -> bool:
+def _free(kind: RobotKind, site: Site, start: np.ndarray, goal: np.ndarray) -> bool:
     """Nothing too steep and no boulder within reach of the straight line."""
     points = start + np.linspace(0, 1, 80)[:, None] * (goal - start)
-    _, normal = site.surface.plane(jnp.asarray(points, jnp.float32), LEGGED.footprint)
-    if float(normal[:, 2].min()) < math.cos(LEGGED.max_slope):
+    _, normal = site.surface.plane(jnp.asarray(points, jnp.float32), kind.footprint)
+    if float(normal[:, 2].min()) < math.cos(kind.max_slope):
         return False
     grounds = np.asarray(site.surface.height(jnp.asarray(points, jnp.float32)))
     for rock in site.boulders:
         away = np.linalg.norm(points - np.asarray(rock.centre[:2])[None, :], axis=1)
         near = int(np.argmin(away))
-        if away[near] < rock.reach(float(grounds[near])) + LEGGED.footprint + 0.1:
+        if away[near] < rock.reach(float(grounds[near])) + kind.footprint + 0.1:
             return False
     return True
 
 
 def evaluate(
-    ground: str, seeds: range, per_site: int, friction: float, threads: int
+    kind: RobotKind, ground: str, seeds: range, per_site: int, friction: float, threads: int
 ) -> dict[str, object]:
     """Random 20 m traverses of a preset, or of 4 cm rms roughness; what a report wants."""
     parts: list[Walks] = []
@@ -262,16 +269,16 @@ def evaluate(
             site = site_of(rough_ground((161, 161), 0.04, seed, SPACING), "rough")
         else:
             site = make_site(ground, seed, 40.0)
-        ends = traverses(site, per_site, 20.0, np.random.default_rng(seed))
+        ends = traverses(kind, site, per_site, 20.0, np.random.default_rng(seed))
         if not len(ends):
             continue
         placements = [
-            Placement("r", LEGGED, (e[0], e[1]), math.atan2(e[3] - e[1], e[2] - e[0]))
+            Placement("r", kind, (e[0], e[1]), math.atan2(e[3] - e[1], e[2] - e[0]))
             for e in ends
         ]
         scene = build_scene(site, placements[:1], friction=friction)
         starts = np.array([start_pose(site, p) for p in placements])
-        parts.append(walk(scene, starts, ends[:, 2:], 120.0, threads=threads))
+        parts.append(walk(kind, scene, starts, ends[:, 2:], 120.0, threads=threads))
     walks = Walks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     return {"ground": ground, "seeds": [seeds.start, seeds.stop - 1], **summary(walks)}
 
@@ -302,10 +309,11 @@ def summary(walks: Walks) -> dict[str, object]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of `python -m moonteam.robots.tune_legged`."""
+    """Entry point of `python -m moonteam.physics.trials.tune`."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("kind", help="name of a registered kind, or FILE.py:OBJECT")
     parser.add_argument("--search", type=int, default=0, help="generations to search")
-    parser.add_argument("--size", type=int, default=16, help="gaits a generation")
+    parser.add_argument("--size", type=int, default=16, help="samples a generation")
     parser.add_argument("--seed", type=int, default=1, help="first seed")
     parser.add_argument("--evaluate", action="store_true", help="print figures as JSON")
     parser.add_argument("--grounds", nargs="+", default=["course", "rough", "mare", "highland"])
@@ -315,26 +323,31 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(arguments)
     enable_cache()
+    try:
+        kind = KINDS.get(args.kind)
+        tuning_of(kind)
+    except InputError as error:
+        parser.error(str(error))
     if args.search:
-        print(search(args.search, args.size, args.seed))
+        print(search(kind, args.search, args.size, args.seed))
     if args.evaluate:
         seeds = range(args.seed, args.seed + args.sites)
         rows = []
         for ground in args.grounds:
             if ground == "course":
-                rows.extend(course_rows(seeds, args.friction))
+                rows.extend(course_rows(kind, seeds, args.friction))
             else:
-                rows.append(evaluate(ground, seeds, args.walks, args.friction, args.threads))
+                rows.append(evaluate(kind, ground, seeds, args.walks, args.friction, args.threads))
         print(json.dumps(rows, indent=1))
 
 
-def course_rows(seeds: range, friction: float) -> list[dict[str, object]]:
+def course_rows(kind: RobotKind, seeds: range, friction: float) -> list[dict[str, object]]:
     """Figures lane by lane."""
     parts: list[Walks] = []
     for seed in seeds:
         site = course(seed)
-        scene = build_scene(site, [Placement("r", LEGGED, (-4.5, 0.0))], friction=friction)
-        parts.append(walk(scene, *lanes(site), 60.0))
+        scene = build_scene(site, [Placement("r", kind, (-4.5, 0.0))], friction=friction)
+        parts.append(walk(kind, scene, *lanes(kind, site), 60.0))
     by_lane = Walks(*(np.stack(columns, axis=1) for columns in zip(*parts, strict=True)))
     return [
         {"ground": name, "seeds": [seeds.start, seeds.stop - 1],
