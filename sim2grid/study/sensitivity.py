@@ -28,6 +28,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from moonteam import trees
 from moonteam.errors import InputError
 from moonteam.planners.base import Planner
 from moonteam.report.intervals import Bootstrap
@@ -242,7 +243,7 @@ class DelayedBackend:
         if not self._sent:
             self._sent.extend([hold] * self._late)
         elif fresh.any():
-            mixed = {id(old): _rows(fresh, hold, old) for old in self._sent}
+            mixed = {id(old): trees.where(fresh, hold, old) for old in self._sent}
             self._sent = deque(mixed[id(old)] for old in self._sent)
         self._sent.extend([commands] * (num_control_steps // self.log_every))
         logs, left = [], num_control_steps // self.log_every
@@ -263,12 +264,6 @@ class DelayedBackend:
         """Where a robot stands in every row, [B, 2] m."""
         base = self._engine.scene.robots[robot].qpos.start  # pyright: ignore
         return jnp.asarray(np.asarray(state.qpos)[:, base:base + 2], jnp.float32)
-
-
-def _rows(which: npt.NDArray[np.bool_], new: Any, old: Any) -> Any:
-    """`new` in the rows [B] that are chosen, else `old`, leaf by leaf."""
-    return jax.tree.map(
-        lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 
 def wilson(won: int, count: int, z: float = 1.96) -> tuple[float, float]:

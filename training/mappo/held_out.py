@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from moonteam import trees
 from training.mappo.networks import Networks
-from training.mappo.rollout import choose
 from training.mappo.task import EnvState, Task
 
 HELD_OUT_SEED = 715517
@@ -52,7 +52,7 @@ def score(networks: Networks, task: Task, actor: dict, key: Array, num_scenarios
                   else jnp.argmax(logits[0], axis=-1))
         out = task.step(env_key, walk.state, action)
         after = _Walk(out.state, memory, out.terminated, out.steps, out.moves)
-        return choose(walk.solved, walk, after), None
+        return trees.where(walk.solved, walk, after), None
 
     none = jnp.zeros(num_scenarios, jnp.int32)
     walk = _Walk(state, networks.empty(num_scenarios).actor, never[0], none, none)

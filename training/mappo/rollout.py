@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from moonteam import trees
 from training import sharding
 from training.mappo.networks import Networks, Pair
 from training.mappo.task import EnvState, Task
@@ -82,14 +83,6 @@ def begin(networks: Networks, task: Task, key: Array, num_envs: int) -> Carry:
     return Carry(state, task.observe(state), jnp.ones(num_envs, bool), networks.empty(num_envs))
 
 
-def choose(mask: Array, yes: EnvState, no: EnvState) -> EnvState:
-    """Per environment: `yes` where mask [E], else `no`; leaves have a leading axis E."""
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(pick, yes, no)
-
-
 def collect(networks: Networks, task: Task, params: Pair, carry: Carry, key: Array,
             num_steps: int) -> tuple[Carry, Rollout]:
     """Steps every environment `num_steps` times with sampled actions."""
@@ -123,9 +116,9 @@ def _step(networks: Networks, task: Task, params: Pair, walk: _Walk, starts: tup
 
     ended = out.terminated | out.truncated
     fresh, fresh_obs = jax.tree.map(lambda x: jnp.roll(x, t, axis=0), (pool, pool_obs))
-    state, obs_next = choose(ended, (fresh, fresh_obs), (out.state, final_obs))
+    state, obs_next = trees.where(ended, (fresh, fresh_obs), (out.state, final_obs))
     following = Carry(state, obs_next, ended, Pair(actor_memory, critic_memory))
-    cut = choose(out.truncated, Cut(final_obs, critic_memory), walk.cut)
+    cut = trees.where(out.truncated, Cut(final_obs, critic_memory), walk.cut)
     tally = Tally(*(total + new for total, new in zip(walk.tally, (
         ended, out.terminated, jnp.where(ended, out.steps, 0), jnp.where(ended, out.moves, 0)),
         strict=True)))

@@ -22,6 +22,7 @@ import optax
 from jax import Array
 from jax.sharding import Mesh
 
+from moonteam import trees
 from moonteam.errors import InputError
 from moonteam.grid import env, scenarios, travel
 from moonteam.grid.config import EnvConfig
@@ -228,11 +229,8 @@ def renew(family: Family, ground: Ground | None, key: Array, walk: Walk, ended: 
     """New episodes where they ended [E]."""
     fresh = fresh_episodes(family, ground, key, ended.shape[0])
 
-    def swap(new: Array, old: Array) -> Array:
-        return jnp.where(ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
     old = (walk.states, walk.place, walk.preference)
-    states, place, wish = jax.tree.map(swap, fresh, old)
+    states, place, wish = trees.where(ended, fresh, old)
     return walk._replace(states=states, place=place, preference=wish)
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from jax import Array
 
+from moonteam import trees
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.world import Walk, World
 from moonteam.grid.config import EnvConfig
@@ -150,10 +151,7 @@ def begin(player: Player, source: Source, scenario: Array, attempt: Array) -> Po
 def _refill(player: Player, source: Source, pool: Pool, taken: Array, scenario: Array,
             attempt: Array) -> Pool:
     """The pool with fresh episodes in the places that are `taken` [E] bool."""
-    def pick(new: Array, old: Array) -> Array:
-        return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(pick, player.fresh(source, scenario, attempt), pool)
+    return trees.where(taken, player.fresh(source, scenario, attempt), pool)
 
 
 @partial(jax.jit, static_argnames="player")

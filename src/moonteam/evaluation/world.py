@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from jax import Array
 
+from moonteam import trees
 from moonteam.errors import InputError
 from moonteam.evaluation.metrics import Family
 from moonteam.grid import env, scenarios
@@ -111,11 +112,8 @@ def advance(config: EnvConfig, walk: Walk, horizon: Array, actions: Array,
     if pause and before is not None and now is not None:
         appeared = now.used > before.used
 
-    def pick(new: Array, old: Array) -> Array:
-        return jnp.where(going.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
     return Walk(
-        state=jax.tree.map(pick, after, walk.state),
+        state=trees.where(going, after, walk.state),
         moves=walk.moves + jnp.where(going, _effort(walk.state.problem, actions), 0),
         waiting=walk.waiting | (going & appeared))
 

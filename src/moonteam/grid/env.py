@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from moonteam import trees
 from moonteam.grid import rewards
 from moonteam.grid.config import NUM_ACTIONS, EnvConfig
 from moonteam.grid.observe import observe
@@ -134,9 +135,7 @@ def renew(config: EnvConfig, key: Array, states: State, ended: Array,
                             fresh(few), states)
 
     def by_all() -> State:
-        chosen = lambda new, old: jnp.where(
-            ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-        return jax.tree.map(chosen, fresh(num_envs), states)
+        return trees.where(ended, fresh(num_envs), states)
 
     return jax.lax.cond(jnp.sum(ended) <= few, by_few, by_all)
 

@@ -23,6 +23,7 @@ import numpy as np
 from jax import Array
 from mujoco.batch import Batch
 
+from moonteam import trees
 from moonteam.physics import mjx
 from moonteam.physics.scene import Scene, SceneRobot
 from moonteam.robots.base import CONTROL_PERIOD, Command
@@ -138,13 +139,6 @@ def _bad(qpos: Array, qvel: Array) -> Array:
     return ~finite | (jnp.abs(qvel).max(axis=-1) > MAX_SPEED)
 
 
-def _keep(frozen: Array, old: Any, new: Any) -> Any:
-    """`old` where frozen [] or [B], else `new`, leaf by leaf."""
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(frozen.reshape(frozen.shape + (1,) * (b.ndim - frozen.ndim)), a, b)
-    return jax.tree.map(pick, old, new)
-
-
 def _strong(tree: Any) -> Any:
     """The same arrays with fixed types, so that a compiled program takes them."""
     return jax.tree.map(
@@ -240,9 +234,9 @@ class MjxBackend:
                            jnp.zeros((), bool), controls)
         stopped = world._replace(qvel=jnp.zeros_like(world.qvel), diverged=jnp.ones((), bool))
         frozen = world.diverged | bad
-        return (_keep(frozen, stopped, moved),
-                (_keep(frozen, jnp.zeros_like(power), power),
-                 _keep(frozen, jnp.zeros_like(propellant), propellant)))
+        return (trees.where(frozen, stopped, moved),
+                (trees.where(frozen, jnp.zeros_like(power), power),
+                 trees.where(frozen, jnp.zeros_like(propellant), propellant)))
 
 
 class NativeBackend:

@@ -4,6 +4,14 @@ The entity network's inputs are the fields of `entity.Entities`, with symbolic d
 `batch`, `agents` and `targets`; see `onboard` for what builds them. Names and order of the
 computation follow `entity.py` and `recurrent.py`, to which tests hold the results.
 
+Why not by jax2onnx (0.17.1, tried with JAX 0.10.2, flax 0.12.8, onnx 1.23.2): of the entity
+network it can make no graph for any number of robots and targets. It loses the dimension of
+agents and targets joined in one axis (after the first block the targets' part has length 0),
+where `jax.export` keeps it. With 3 robots and 7 targets fixed it does write a file, 20 % larger
+(574 kB, 553 nodes; ours 485 kB, 297 nodes), but ONNX Runtime 1.31.1 loads it neither at opset 17
+(no BitwiseOr there) nor at 21 (a Reshape of incompatible shapes). The recurrent actor alone comes
+out right (485 kB). And it wants orbax-checkpoint < 0.11.37; the runs' checkpoints use 0.12.
+
 Legend: B batch, N agents, M targets, E = N + M tokens, S skill bits, D width, K heads.
 """
 
