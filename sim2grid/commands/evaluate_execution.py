@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from moonteam import files
 from moonteam.commands.options import Missions, Reported, Resumable
 from moonteam.report import command
 from moonteam.report.command import Aside
+from moonteam.report.progress import say
 from sim2grid.study import journal
 from sim2grid.study.journal import Journal
 
@@ -110,7 +110,7 @@ def run(args: Args) -> int:
     if args.out:
         _save(args.out, report, rows)
     _print(args, report)
-    _say(f"{len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
+    say(f"moonteam: {len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
     return journal.interrupted(args.out) if interrupted else 0
 
 
@@ -134,7 +134,7 @@ def _evaluation(args: Args) -> Evaluation:
                      args.decode if name == "policy" else "argmax", args.objective)
            for name in args.planner]
     return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who, args.backend),
-                      args.seed, args.width, args.threads, progress=journal.progress)
+                      args.seed, args.width, args.threads)
 
 
 def _options(args: Args) -> dict[str, Any]:
@@ -171,8 +171,3 @@ def _print(args: Args, report: dict[str, Any]) -> None:
                  for row in rows]
         turned = [[title, *(row[k] for row in rows)] for k, title in enumerate(titles) if k > 3]
         show_plain(report, [(["", *heads], turned), *more])
-
-
-def _say(text: str) -> None:
-    if sys.stderr.isatty():
-        print(f"moonteam: {text}", file=sys.stderr)

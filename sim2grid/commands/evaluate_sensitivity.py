@@ -91,9 +91,7 @@ def run(args: Args) -> int:
             said = run_setting(
                 setting, recipe, args.count, chosen, seed=args.seed, width=args.width,
                 done=rows.of(setting),
-                keep=lambda row, key=setting.key: rows.add(key, row),
-                progress=lambda title, done, total, key=setting.key: journal.progress(
-                    f"{key}: {title}", done, total))
+                keep=lambda row, key=setting.key: rows.add(key, row))
             if said:
                 impossible[setting.key] = said
     except KeyboardInterrupt:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -21,6 +20,7 @@ from moonteam.problem import mission as missions
 from moonteam.problem.mission import Mission
 from moonteam.report import command
 from moonteam.report.command import Aside
+from moonteam.report.progress import bar, say
 
 if TYPE_CHECKING:
     from moonteam.planners.base import Planner
@@ -140,8 +140,8 @@ def run(args: Args) -> int:
     else:
         _show(report, timing, out, video)
     if made.before is not None and report != made.before:
-        _say(f"not as in {args.report}: {_difference(made.before, report)}; another machine or "
-             "other versions?")
+        print(f"moonteam: not as in {args.report}: {_difference(made.before, report)}; another "
+              "machine or other versions?", file=sys.stderr)
     return 0 if report.success else 1
 
 
@@ -249,13 +249,13 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
     from sim2grid.loop.drive import run as run_executions
 
     execution, prepared = made.execution, made.prepared
-    _say(f"compiling the {made.backend} physics "
-         "(kept for later runs; the first time takes longest)")
+    say(f"moonteam: compiling the {made.backend} physics "
+        "(kept for later runs; the first time takes longest)")
     backend = make_backend(made.backend, prepared.scene)
     begun = time.perf_counter()
     looks: list[float] = []
     with contextlib.ExitStack() as open_until:
-        update = open_until.enter_context(_bar("mission", len(execution.record.targets)))
+        update = open_until.enter_context(bar("mission", len(execution.record.targets)))
         show = None
         if args.viewer:
             from sim2grid.show.viewer import LiveView
@@ -338,7 +338,7 @@ def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:
         print("moonteam: no 3-D video; making map.mp4 instead", file=sys.stderr)
         path = out / "map.mp4"
     count = 0
-    with _bar("video", film.num_frames) as update:
+    with bar("video", film.num_frames) as update:
 
         def drawn() -> None:
             nonlocal count
@@ -349,25 +349,6 @@ def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:
     if views is not None:
         views.shut()
     return path
-
-
-@contextlib.contextmanager
-def _bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
-    """A progress bar on standard error if that is a terminal: `update(done, words)`."""
-    if not sys.stderr.isatty():
-        yield lambda done, words: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    with Progress(TextColumn(title), BarColumn(), TextColumn("{task.fields[words]}"),
-                  TimeElapsedColumn(), console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(title, total=total, words="")
-        yield lambda done, words: progress.update(task, completed=done, words=words)
-
-
-def _say(text: str) -> None:
-    print(f"moonteam: {text}", file=sys.stderr, flush=True)
 
 
 def _difference(before: Report, now: Report) -> str:

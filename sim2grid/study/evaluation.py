@@ -26,6 +26,7 @@ import numpy as np
 from moonteam import paths
 from moonteam.planners.base import Objective, Planner
 from moonteam.problem.mission import Mission
+from moonteam.report.progress import bar
 from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.brains import planner_maker
 from sim2grid.loop.drive import Backend, run
@@ -123,9 +124,9 @@ class Evaluation:
     width: int = 25  # B
     threads: int = 0  # of the native engine, 0 for all CPUs
     keep: Callable[[Row], None] = lambda row: None
-    progress: Callable[[str, int, int], None] = lambda title, done, total: None
     rows: dict[tuple[str, int], Row] = field(default_factory=dict)
     entries: list[Entry] = field(default_factory=list)
+    label: str = ""  # before what the progress bar is called
 
     def run(self) -> None:
         """Runs what is not done yet. Raises InputError before a mission that cannot be run."""
@@ -173,7 +174,8 @@ class Group:
             routes = [plan.route for plan in self._on_grid(contender, make, events=False)]
         executions = [self._execution(contender, make, k, routes[k]) for k in todo]
         done = len(self._fleet.missions) - len(todo)
-        title = f"{self._fleet.site.name}: {contender.name}"
+        total = len(self._fleet.missions)
+        title = f"{self._all.label}{self._fleet.site.name}: {contender.name}"
 
         def finished(index: int) -> None:
             nonlocal done
@@ -182,11 +184,12 @@ class Group:
             executions[index].book.record = Record()  # its poses are not needed any more
             self._keep(contender, k, report, grid[k])
             done += 1
-            self._all.progress(title, done, len(self._fleet.missions))
+            update(done, f"{done} of {total} missions")
 
-        self._all.progress(title, done, len(self._fleet.missions))
-        run(executions, self._backend(contender.backend), self._fleet.starts[todo],
-            width=self._width, rows=[k % self._width for k in todo], finished=finished)
+        with bar(title, total, done) as update:
+            update(done, f"{done} of {total} missions")
+            run(executions, self._backend(contender.backend), self._fleet.starts[todo],
+                width=self._width, rows=[k % self._width for k in todo], finished=finished)
 
     def _backend(self, name: str) -> Backend:
         if name not in self._engines:

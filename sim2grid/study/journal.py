@@ -1,4 +1,4 @@
-"""A run over many missions that can be interrupted: its folder, its options, its progress."""
+"""A run over many missions that can be interrupted: its folder and its options."""
 
 from __future__ import annotations
 
@@ -89,13 +89,6 @@ def check(args: Any, ranges: Sequence[tuple[str, float, float]],
             raise InputError(flag(name), "give each once, and at least one")
     if args.resume and args.out is None:
         raise InputError("--resume", "needs the folder of the run to go on with: --out DIR")
-
-
-def progress(title: str, done: int, total: int) -> None:
-    """A line on standard error that is written over, if that is a terminal."""
-    if sys.stderr.isatty():
-        end = "\n" if done == total else ""
-        print(f"\r\x1b[K{title}: {done} of {total} missions", end=end, file=sys.stderr, flush=True)
 
 
 def interrupted(out: Path | None) -> int:

@@ -31,7 +31,7 @@ import numpy.typing as npt
 from moonteam import trees
 from moonteam.errors import InputError
 from moonteam.planners.base import Planner
-from moonteam.report.intervals import Bootstrap
+from moonteam.report.intervals import Bootstrap, wilson
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.terrain.site import Boulder, make_site
 from moonteam.terrain.site import Site as Ground
@@ -89,13 +89,13 @@ def settings(quantities: Sequence[Quantity]) -> list[Setting]:
 
 def run_setting(setting: Setting, recipe: Recipe, count: int, contenders: Sequence[Contender], *,
                 seed: int, width: int, done: dict[tuple[str, int], Row],
-                keep: Callable[[Row], None], progress: Callable[[str, int, int], None]) -> str:
+                keep: Callable[[Row], None]) -> str:
     """Runs the missions of one setting that are not `done`; returns why there are none, or "".
 
     `keep` is called with each new row.
     """
     evaluation = Evaluation([recipe], count, contenders, seed, width, keep=keep,
-                            progress=progress, rows=dict(done))
+                            rows=dict(done), label=f"{setting.key}: ")
     try:
         fleet = make_fleet(recipe, count, changed_ground(setting))
     except InputError as error:
@@ -264,16 +264,6 @@ class DelayedBackend:
         """Where a robot stands in every row, [B, 2] m."""
         base = self._engine.scene.robots[robot].qpos.start  # pyright: ignore
         return jnp.asarray(np.asarray(state.qpos)[:, base:base + 2], jnp.float32)
-
-
-def wilson(won: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """The 95 % score interval of a share (Wilson 1927): honest where all or none succeed."""
-    if count == 0:
-        return 0.0, 1.0
-    share, more = won / count, z * z / count
-    middle = (share + more / 2) / (1 + more)
-    half = z / (1 + more) * math.sqrt(share * (1 - share) / count + more / (4 * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def point(rows: Sequence[Row], seed: int) -> dict[str, Any]:

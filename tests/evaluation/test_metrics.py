@@ -1,4 +1,4 @@
-"""The arithmetic of the tables on rows made by hand, and the bootstrap."""
+"""The arithmetic of the tables on rows made by hand."""
 
 from collections import Counter
 
@@ -66,39 +66,6 @@ def test_rows_say_null_where_a_planner_failed():
 def test_lengths_must_agree():
     with pytest.raises(ValueError, match="one length"):
         outcomes([True], [3, 4], [5, 6])
-
-
-def test_bootstrap_interval_is_that_of_the_normal_mean():
-    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
-    figure = Bootstrap(400, seed=0).mean(values)
-    half = 1.96 * values.std() / 20
-    assert figure.value == pytest.approx(values.mean())
-    assert figure.low == pytest.approx(values.mean() - half, abs=0.05)
-    assert figure.high == pytest.approx(values.mean() + half, abs=0.05)
-
-
-def test_bootstrap_covers_the_truth_about_as_often_as_it_says():
-    rng = np.random.default_rng(1)
-    hits = 0
-    for trial in range(200):
-        values = rng.exponential(1.0, (2, 80))
-        figure = Bootstrap(80, seed=trial, resamples=400).ratio(values[0], values[1])
-        hits += figure.low <= 1.0 <= figure.high
-    assert 0.90 <= hits / 200 <= 0.985
-
-
-def test_bootstrap_is_paired_and_repeatable():
-    values = np.random.default_rng(0).normal(size=50)
-    one, two = Bootstrap(50, seed=4), Bootstrap(50, seed=4)
-    assert one.mean(values) == two.mean(values)
-    assert one.mean(values) != Bootstrap(50, seed=5).mean(values)
-    # Twice as long on every scenario: the gap has no spread, only paired draws show that.
-    assert one.ratio(2 * np.abs(values), np.abs(values)) == pytest.approx((2.0, 2.0, 2.0))
-
-
-def test_nothing_known_is_not_a_number():
-    figure = Bootstrap(3, seed=0).ratio(np.ones(3), np.full(3, np.nan))
-    assert all(np.isnan(v) for v in figure)
 
 
 def scenario(optimal=None, targets=1):

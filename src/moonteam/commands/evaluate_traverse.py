@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,6 +12,7 @@ from moonteam.commands.options import Reported
 from moonteam.errors import InputError
 from moonteam.files import replacing
 from moonteam.report.command import Aside
+from moonteam.report.progress import busy
 
 if TYPE_CHECKING:
     from moonteam.physics.trials.film import Shot
@@ -134,9 +133,11 @@ def _run_kind(args: Args, kind: RobotKind, stills: list) -> tuple[list[Traverse]
     shots = choose(places) if args.video else []
     for place, (site, routes) in enumerate(places):
         mine = [shot for shot in shots if shot.place == place]
-        with _watched(f"{kind.name} on {args.site} {site.seed}") as watch:
+        label = f"{kind.name} on {args.site} {site.seed}"
+        with busy(label) as say:
             found, recordings = run_traverses(
-                kind, site, routes, backend=args.backend, watch=watch,
+                kind, site, routes, backend=args.backend,
+                watch=lambda s, label=label, say=say: say(f"{label}: {s:.0f} s simulated"),
                 record=[shot.route for shot in mine])
         rows += found
         for shot, recording in zip(mine, recordings, strict=True):
@@ -155,18 +156,6 @@ def _film(args: Args, name: str, shot: Shot, recording: Recording, stills: list)
                            event=shot.event, along=shot.along))
     except RenderingUnavailable as error:
         print(f"moonteam: no video: {error}", file=sys.stderr)
-
-
-@contextlib.contextmanager
-def _watched(label: str) -> Iterator[Callable[[float], None]]:
-    """A line on standard error with the simulated seconds, where that is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda seconds: None
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status(label) as status:
-        yield lambda seconds: status.update(f"{label}: {seconds:.0f} s simulated")
 
 
 def _write_csv(path: Path, rows: list[Traverse]) -> None:

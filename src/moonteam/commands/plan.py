@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from moonteam.errors import InputError
 from moonteam.planners.base import Objective, Plan, Snapshot
 from moonteam.problem import scenario
 from moonteam.problem.scenario import Scenario
+from moonteam.report.progress import busy
 
 PlannerName = Literal["exact", "greedy", "lns", "cpsat", "exhaustive", "policy"]
 
@@ -215,21 +215,11 @@ def _verdict(plan: Plan, alpha: float, beta: float) -> str:
     return f"feasible: proved that no plan has less than {plan.bound:g} of {goal}"
 
 
-def _busy() -> contextlib.AbstractContextManager[object]:
-    """A sign of life on a terminal: the searches are compiled when first used on a machine."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        return contextlib.nullcontext()
-    return console.status("planning; the first time on a machine it compiles for a minute")
-
-
 def run(args: Args) -> int:
     """Plans, prints, and draws; 1 if there is no plan."""
     check(args)
     case = load_case(args.scenario)
-    with _busy():
+    with busy("planning; the first time on a machine it compiles for a minute"):
         plan = make_plan(args, Snapshot.start(case.scenario))
     if args.json:
         print(files.dump_json(plan.document()))

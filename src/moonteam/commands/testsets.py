@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from moonteam import files
 from moonteam.commands.options import Printed
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Optimal, Scenario, save_set
+from moonteam.report import progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -136,8 +136,8 @@ def best_known(scenario: Scenario, iterations: int, starts: int) -> Optimal | No
                    bound_makespan=low_makespan, bound_moves=low_moves)
 
 
-def make(recipe: Recipe, args: Args, tick) -> list[Scenario]:
-    """One set; `tick(done)` is told about progress."""
+def make(recipe: Recipe, args: Args, update: Callable[[int, str], None]) -> list[Scenario]:
+    """One set; `update(done, words)` is told about progress."""
     from moonteam.compilation import cores
 
     wanted = args.count or recipe.count
@@ -155,7 +155,7 @@ def make(recipe: Recipe, args: Args, tick) -> list[Scenario]:
                 if optimal is not None:
                     name = f"{recipe.name()}-{len(found):04d}"
                     found.append(msgspec.structs.replace(scenario, id=name, optimal=optimal))
-            tick(len(found))
+            update(len(found), f"{len(found)} of {wanted}")
     return found
 
 
@@ -170,23 +170,19 @@ def run(args: Args) -> int:
             raise InputError(option, f"{value} is not allowed; at least 1")
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
     index_path = args.out / "index.json"
     index = json.loads(files.read_text(index_path)) if index_path.exists() else {}
-    with Progress(console=console, disable=not sys.stderr.isatty()) as progress:
-        for recipe in RECIPES:
-            if recipe.name() not in args.sets:
-                continue
-            bar = progress.add_task(recipe.name(), total=args.count or recipe.count)
-            scenarios = make(recipe, args, lambda n, b=bar: progress.update(b, completed=n))
-            save_set(args.out / f"{recipe.name()}.jsonl", scenarios)
-            index[recipe.name()] = describe(recipe, args, scenarios)
-            files.write_json(index_path, dict(sorted(index.items())))
-            if not args.json:
-                print(summary(recipe.name(), index[recipe.name()]), flush=True)
+    for recipe in RECIPES:
+        name = recipe.name()
+        if name not in args.sets:
+            continue
+        with progress.bar(name, args.count or recipe.count) as update:
+            scenarios = make(recipe, args, update)
+        save_set(args.out / f"{name}.jsonl", scenarios)
+        index[name] = describe(recipe, args, scenarios)
+        files.write_json(index_path, dict(sorted(index.items())))
+        if not args.json:
+            print(summary(name, index[name]), flush=True)
     if args.json:
         print(files.dump_json(index))
     return 0

@@ -1,4 +1,4 @@
-"""Bootstrap intervals of means and of ratios of means.
+"""Intervals: bootstrap for means and for ratios of means, Wilson for shares.
 
 Every figure of a report is resampled with the same draws, scenario by scenario, so that
 planners on one set are compared on the same resampled sets. Legend: S scenarios, R draws.
@@ -26,6 +26,19 @@ class Figure(NamedTuple):
 
 
 NOTHING = Figure(math.nan, math.nan, math.nan)
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """The score interval of a share (Wilson 1927): honest where all or none of `count` are hits.
+
+    (0, 1) where nothing was counted.
+    """
+    if count == 0:
+        return 0.0, 1.0
+    from scipy.stats import binomtest
+
+    found = binomtest(hits, count).proportion_ci(LEVEL, method="wilson")
+    return float(found.low), float(found.high)
 
 
 class Bootstrap:

@@ -42,6 +42,21 @@ def bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int, str], 
         yield lambda done, words: progress.update(task, completed=done, words=words)
 
 
+@contextmanager
+def busy(text: str) -> Iterator[Callable[[str], None]]:
+    """A sign of life on standard error if that is a terminal, where no end can be foreseen.
+
+    `update(text)` changes what it says.
+    """
+    if not sys.stderr.isatty():
+        yield lambda text: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(text) as status:
+        yield lambda text: status.update(text)
+
+
 def say(text: str) -> None:
     """A passing remark on standard error, if it is a terminal (such as: compiling)."""
     if sys.stderr.isatty():

@@ -65,12 +65,6 @@ def test_failures_are_told_apart(outcome, row):
     assert math.isnan(row().rest_error_m)
 
 
-def test_wilson_interval():
-    assert traverse.wilson(50, 50) == pytest.approx([0.9287, 1.0], abs=1e-4)
-    assert traverse.wilson(0, 50) == pytest.approx([0.0, 0.0713], abs=1e-4)
-    assert traverse.wilson(25, 50) == pytest.approx([0.3664, 0.6336], abs=1e-4)
-
-
 def test_routes_keep_off_walls_and_boulders():
     heights = np.zeros((121, 121))
     heights[:, 60:] = 3.0  # a wall along x = 0

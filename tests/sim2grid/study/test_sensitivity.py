@@ -22,7 +22,6 @@ from sim2grid.study.sensitivity import (
     settings,
     strewn,
     tilted,
-    wilson,
 )
 
 CHUNK = 5 * CONTROL_PERIOD
@@ -145,13 +144,6 @@ def test_only_where_a_robot_truly_stands_solves_a_target(noisy, monkeypatch):
     assert not east.record.success, "it stands 0.6 m west of the target's centre"
     arrived = [leg.end_cell for leg in east.record.legs if leg.ended == "arrived"]
     assert (2, 0) in arrived, "and believes to be there"
-
-
-def test_wilsons_interval_at_the_ends():
-    assert wilson(10, 10) == pytest.approx((0.7225, 1.0), abs=1e-3)
-    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-3)
-    assert wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-3)
-    assert wilson(0, 0) == (0.0, 1.0)
 
 
 def test_the_usual_setting_is_run_once():

@@ -19,6 +19,7 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.physics.backends import make_backend
 from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
+from moonteam.report.intervals import wilson
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
 from moonteam.terrain.site import Site
 from moonteam.terrain.traversability import POINT_SPACING, STRAY, passable
@@ -266,14 +267,6 @@ def summarise(rows: Sequence[Traverse]) -> dict[str, Any]:
     summary["cross_track_max_m"] = max((r["cross_track_max_m"] for r in arrived), default=None)
     summary["tilt_max_deg"] = max((r["tilt_max_deg"] for r in arrived), default=None)
     return summary
-
-
-def wilson(hits: int, count: int, z: float = 1.96) -> list[float]:
-    """Wilson's score interval [low, high] of a share (Wilson 1927)."""
-    share, weight = hits / count, z * z / count
-    centre = (share + weight / 2) / (1 + weight)
-    half = z / (1 + weight) * math.sqrt(share * (1 - share) / count + weight / (4 * count))
-    return [max(0.0, centre - half), min(1.0, centre + half)]
 
 
 def _mean(values: np.ndarray, power: int) -> tuple[float | None, list[float] | None]:
