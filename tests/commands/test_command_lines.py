@@ -16,8 +16,7 @@ from moonteam import cli
 from moonteam.commands import options
 from moonteam.report import command
 from moonteam.report.command import Aside
-from training.commands import imitate, refine, train
-from training.run import compare
+from training.commands import compare, imitate, refine, train
 
 TRAIN = {"train quick": imitate.Args, "train refine": refine.Args, "train compare": compare.Args}
 KINDS = {name: importlib.import_module(module).Args

@@ -34,7 +34,7 @@ def compiled(work: Callable[[Any], Any], held: Any, spread: Any = None) -> tuple
     import jax
 
     from training import sharding
-    from training.run import account
+    from training.bench import account
 
     with sharding.mesh_of(jax.numpy.zeros(()) if spread is None else spread):
         start = time.perf_counter()

@@ -30,9 +30,9 @@ def measure(args: Wanted, command: str) -> dict[str, Any]:
     from moonteam.compilation import enable_cache
     from moonteam.report import provenance
     from training import sharding
-    from training.mappo import networks, rollout, update
+    from training.bench import account
+    from training.mappo import config, networks, rollout, update
     from training.mappo.grid_task import GridTask
-    from training.run import account, config, loop
 
     chosen = config.preset(args.preset)
     if args.phase not in dict(chosen.phases):
@@ -80,7 +80,7 @@ def measure(args: Wanted, command: str) -> dict[str, Any]:
         "compiled_bytes": whole["compiled_bytes"], "peak_bytes": peak, "peak_of": peak_of,
         "flops_per_env_step": work, "achieved_gflops": achieved, "matmul_peak_gflops": best,
         "share_of_peak": achieved / best, "repeats": args.repeats,
-        "device": loop.describe_device(), "meta": provenance.meta(command, 0)}
+        "device": sharding.describe_device(), "meta": provenance.meta(command, 0)}
     return document | {"notes": _notes(document)}
 
 

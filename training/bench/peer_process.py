@@ -88,11 +88,10 @@ def ours(load: Load) -> Built:
     from moonteam.policies.recurrent import Recurrent, kernel_count
     from training import sharding
     from training.bench import measure
+    from training.bench.jaxmarl_task import JaxmarlTask
     from training.mappo import update
     from training.mappo.hyper import Hyper
-    from training.mappo.jaxmarl_task import JaxmarlTask
     from training.mappo.networks import Networks
-    from training.run import loop
 
     enable_cache()
     sharding.use_all_cores()
@@ -111,7 +110,7 @@ def ours(load: Load) -> Built:
         lambda held: update.several(nets, task, hyper, held, load.updates), learner,
         learner.carry.reset_before)
     kernels = {name: kernel_count(tree) for name, tree in learner.params._asdict().items()}
-    row = {"device": loop.describe_device(), "compile_s": compile_s, "compiled_bytes": bytes_,
+    row = {"device": sharding.describe_device(), "compile_s": compile_s, "compiled_bytes": bytes_,
            "begin_s": 0.0, "kernel_parameters": kernels, "num_agents": agents,
            "obs_size": task.obs_size, "num_actions": task.num_actions,
            "networks_per_env_step": {"actor": agents, "critic": 1}, "notes": []}
@@ -126,8 +125,8 @@ def theirs(load: Load) -> Built:
 
     from moonteam.compilation import enable_cache
     from moonteam.report.provenance import git
+    from training import sharding
     from training.bench import measure
-    from training.run import loop
 
     enable_cache()
     module, notes = _loaded(load.checkout)
@@ -144,7 +143,7 @@ def theirs(load: Load) -> Built:
         problem = f"does not run with JAX {jax.__version__}: {type(error).__name__}: {error}"
         raise InputError(load.checkout / LOOP, problem) from error
     measure.seconds(lambda: begin(key))
-    row = {"device": loop.describe_device(), "compile_s": compile_s, "compiled_bytes": bytes_,
+    row = {"device": sharding.describe_device(), "compile_s": compile_s, "compiled_bytes": bytes_,
            "begin_s": min(measure.seconds(lambda: begin(key)) for _ in range(3)),
            "notes": notes, "commit": found, **_counts(learned, load)}
     return lambda: program(key), row
@@ -163,7 +162,7 @@ def _counts(learned: Any, load: Load) -> dict[str, Any]:
     from flax.training.train_state import TrainState
 
     from moonteam.policies.recurrent import kernel_count
-    from training.mappo.jaxmarl_task import JaxmarlTask
+    from training.bench.jaxmarl_task import JaxmarlTask
 
     states = [leaf for leaf in jax.tree.leaves(learned, is_leaf=_is_state) if _is_state(leaf)]
     assert all(isinstance(state, TrainState) for state in states)

@@ -3,49 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
-from moonteam import files, paths
-from moonteam.commands.options import Printed, RunFolder, Seeded
+from moonteam import paths
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.planners.learned import EntityBrain, Policy
 from moonteam.policies.entity import EntitySpec
 from moonteam.report.progress import say
-from training.run.folder import Run
-from training.run.loop import stop_on_signals
+from training.commands.ending import Taught, complete
+from training.run.machine import Run
 from training.sharding import use_all_cores
-from training.teacher.imitation import Dagger, Family, Imitation
-
-PAPER = (Family(3, 5), Family(3, 6), Family(3, 7))
-
-PRESETS = {
-    "quick": Imitation(families=PAPER, rounds=900, num_envs=256, batches=2),
-    "any_team": Imitation(
-        families=(
-            *PAPER,
-            Family(2, 6, sides=(8, 32)),
-            Family(3, 9, sides=(16, 48)),
-            Family(4, 7, num_skills=3, sides=(16, 64), max_steps=256),
-            Family(5, 9, num_skills=3, sides=(16, 40)),
-            Family(6, 11, sides=(16, 40), exact_to=9, iterations=100),
-            Family(3, 6, grounds=1024),
-            Family(4, 7, num_skills=3, grounds=512),
-            Family(5, 18, exact_to=7, iterations=100, shrink=4),
-            Family(7, 30, num_skills=3, exact_to=7, iterations=100, shrink=8),
-        ),
-        rounds=1300, batches=2),
-}
-"""Presets of `moonteam train` that imitate the exact planner."""
+from training.teacher.imitation import Dagger
+from training.teacher.presets import PRESETS
 
 
 @dataclass(frozen=True)
-class Args(Seeded, RunFolder, Printed):
+class Args(Taught):
     """Train the policy for any team by imitating the exact planner: quick or any_team.
 
     Examples:
@@ -82,11 +59,11 @@ def run(args: Args) -> int:
         raise InputError("--lr", f"{lr:g} is not allowed; above 0, at most 0.1")
     spec, params = entity_policy(args.begin) if args.begin else (preset.spec, None)
     config = dataclasses.replace(preset, seed=args.seed, rounds=rounds, lr=lr, spec=spec)
-    out = args.out or Path("runs") / f"{args.preset}-{args.seed}"
+    out = args.folder(args.preset, args.seed)
     use_all_cores()
     say("moonteam: making grounds and held-out scenarios, compiling")
-    run = Run(args.preset, "imitation (DAgger)", Dagger(config, params), out, args.resume,
-              args.begin or None)
+    dagger = Dagger(config, params, args.preset, args.begin)
+    run = Run(dagger, out, args.resume, args.checkpoint_seconds, tensorboard=args.tensorboard)
     return complete(run, args.json)
 
 
@@ -102,23 +79,3 @@ def entity_policy(name: str) -> tuple[EntitySpec, Any]:
     if not isinstance(policy.brain, EntityBrain):
         raise InputError(path, "is a network for one team size; only entity policies go on")
     return policy.brain.spec, policy.source.params
-
-
-def complete(run: Run, json: bool) -> int:
-    """Trains to the end, or until stopped, and reports; returns the exit code."""
-    with stop_on_signals() as stop:
-        finished = run.train(stop)
-    if not finished:
-        print(f"moonteam: interrupted after round {run.work.number}, saved; go on with "
-              f"--out {run.out} --resume", file=sys.stderr)
-        return 130
-    report = run.finish()
-    if json:
-        print(files.dump_json(report | {"out": str(run.out)}))
-        return 0
-    for row in report["families"]:
-        print(f"{row['family']}: success {row['success']:.3f}, makespan gap "
-              f"{row['makespan_gap']:.1%}, moves gap {row['moves_gap']:.1%}")
-    print(f"{report['labelled']:,} labelled states in {report['seconds']:.0f} s; policy, curve "
-          f"and report in {run.out}")
-    return 0

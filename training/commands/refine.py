@@ -6,20 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import msgspec
 import tyro
 
-from moonteam.commands.options import Printed, RunFolder, Seeded
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.progress import say
-from training.commands.imitate import PRESETS, complete, entity_policy
-from training.run.folder import Run, draw_curve
+from training.commands.ending import Taught, complete
+from training.commands.imitate import entity_policy
+from training.run import metrics
+from training.run.machine import Run
+from training.run.trainee import Row
+from training.teacher.curve import draw_curve
+from training.teacher.presets import PRESETS
 from training.teacher.refinement import Refinement, Refiner
 
 
 @dataclass(frozen=True)
-class Args(Seeded, RunFolder, Printed):
+class Args(Taught):
     """Refine an imitated policy by MAPPO, with a centralised critic over the same tokens.
 
     Examples:
@@ -59,20 +62,20 @@ def run(args: Args) -> int:
     config = Refinement(
         families=PRESETS[args.families].families, spec=spec, reward=args.reward,
         rounds=args.rounds, lr=args.lr, leash=args.leash, seed=args.seed)
-    out = args.out or Path("runs") / f"refine-{args.seed}"
+    out = args.folder("refine", args.seed)
     say("moonteam: making grounds and held-out scenarios, compiling")
-    work = Run("refine", f"MAPPO from imitation, reward {args.reward}",
-               Refiner(config, params), out, args.resume, str(args.policy))
-    code = complete(work, args.json)
+    refiner = Refiner(config, params, source=args.policy)
+    run = Run(refiner, out, args.resume, args.checkpoint_seconds, tensorboard=args.tensorboard)
+    code = complete(run, args.json)
     if others and code == 0:
-        draw_curve(out / "beside.png", {str(out): work.rows} | others)
+        draw_curve(out / "beside.png", {str(out): run.metrics.rows} | others)
     return code
 
 
-def _rows(folder: Path) -> list[dict]:
-    """The metrics of a run. Raises InputError if the folder holds none."""
-    try:
-        lines = (folder / "metrics.jsonl").read_text().splitlines()
-        return [msgspec.json.decode(line) for line in lines]
-    except (OSError, msgspec.DecodeError) as error:
-        raise InputError("--beside", f"{folder} holds no run that can be read: {error}") from None
+def _rows(folder: Path) -> list[Row]:
+    """The evaluations of a run. Raises InputError if the folder holds none."""
+    rows = [row for row in metrics.read(folder / "metrics.jsonl") if "families" in row]
+    if not rows:
+        raise InputError("--beside", f"{folder} holds no run that can be read: no evaluation in "
+                         "its metrics.jsonl")
+    return rows

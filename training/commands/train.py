@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,26 +9,25 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from moonteam import files
-from moonteam.commands.options import Printed, RunFolder
 from moonteam.commands.options import parse as parse_words
 from moonteam.report.command import Aside
-from training.run import config as configs
-from training.run.config import Config
+from training.commands.ending import Watched, complete
+from training.mappo import config as configs
+from training.mappo.config import Config
 
 if TYPE_CHECKING:
-    from training.commands import imitate, refine
-    from training.run import compare
+    from training.commands import compare, imitate, refine
 
 IMITATION = ("quick", "any_team")
 """Presets that imitate the exact planner; see `training.commands.imitate`."""
 REFINE = "refine"
 """MAPPO from an imitated policy; see `training.commands.refine`."""
 COMPARE = "compare"
-"""Runs side by side; see `training.run.compare`."""
+"""Runs side by side; see `training.commands.compare`."""
 
 
 @dataclass(frozen=True)
-class Args(RunFolder, Printed):
+class Args(Watched):
     """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's),
     small and laptop (for two cores).
 
@@ -53,11 +50,6 @@ class Args(RunFolder, Printed):
     begin: Path | None = None
     """A checkpoint of another run, RUN/checkpoints/NUMBER: a new run that goes on from there with
     its own numbers. Network and environments must be as they were."""
-    checkpoint_seconds: Aside[float] = 30.0
-    """Seconds between two checkpoints; a chunk of updates is never cut."""
-    tensorboard: Aside[bool] = False
-    """Write the metrics as TensorBoard events into the run folder too; needs
-    pip install 'moonteam[tensorboard]'."""
     stop_on_collapse: bool = True
     """Stop, with exit code 1, when held-out success has fallen to half of its best for three
     evaluations in a row."""
@@ -88,7 +80,7 @@ def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
 
         return refine.parse(words[1:])
     if words and words[0] == COMPARE:
-        from training.run import compare
+        from training.commands import compare
 
         return compare.parse(words[1:])
     named = bool(words) and not words[0].startswith("-")
@@ -106,14 +98,13 @@ def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
 
     enable_cache()
     if not isinstance(args, Args):
-        from training.commands import imitate, refine
-        from training.run import compare
+        from training.commands import compare, imitate, refine
 
         if isinstance(args, compare.Args):
             return compare.run(args)
         return refine.run(args) if isinstance(args, refine.Args) else imitate.run(args)
     if args.dry_run:
-        from training.run import account
+        from training.bench import account
 
         table = account.describe(args.config, args.compiled)
         print(files.dump_json(table, 2) if args.json else account.as_text(args.config, table))
@@ -123,36 +114,14 @@ def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
 
 def _train(args: Args) -> int:
     from training import sharding
-    from training.run import loop, record
+    from training.mappo.trainee import Mappo
+    from training.run.machine import Run
 
     config = args.config
-    if args.tensorboard:
-        record.tensorboard_writer()  # its lack is said before anything is written
-    out = args.out or Path("runs") / f"{config.name}-{config.seed}"
+    out = args.folder(config.name, config.seed)
     sharding.use_all_cores()
     if args.coordinator:
         sharding.join(args.coordinator, args.processes, args.process)
         out = out / f"process-{args.process}" if args.process else out
-    run = loop.Run(config, out, args.resume, args.checkpoint_seconds, args.stop_on_collapse,
-                   args.tensorboard, args.begin)
-    say = sys.stderr if args.json else sys.stdout
-    try:
-        with loop.stop_on_signals() as stop:
-            finished = run.train(stop)
-    except loop.Diverged as error:
-        print(f"moonteam: {error}", file=sys.stderr)
-        return 1
-    if not finished:
-        print(f"moonteam: interrupted after update {run.position.total_updates}, saved; go on "
-              f"with --out {out} --resume", file=sys.stderr)
-        return 130
-    report = run.finish()
-    if args.json:
-        print(files.dump_json(report | {"out": str(out), "config": dataclasses.asdict(config)}))
-    for decode in ("argmax", "sample"):
-        score = report[decode]
-        print(f"{decode}: success {score['success']:.3f}, makespan {score['makespan']:.2f}, moves "
-              f"{score['moves']:.2f} on {report['scenarios']} held-out scenarios", file=say)
-    print(f"{report['env_steps']:,} env steps in {report['seconds']:.0f} s; policy, curve and "
-          f"report in {out}", file=say)
-    return 0
+    return complete(Run(Mappo(config), out, args.resume, args.checkpoint_seconds,
+                        args.stop_on_collapse, args.tensorboard, args.begin), args.json)

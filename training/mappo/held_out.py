@@ -5,8 +5,9 @@ Legend: E scenarios, N agents.
 
 from __future__ import annotations
 
+import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,3 +59,25 @@ def score(networks: Networks, task: Task, actor: dict, key: Array, num_scenarios
     walk = _Walk(state, networks.empty(num_scenarios).actor, never[0], none, none)
     walk, _ = jax.lax.scan(step, walk, jnp.arange(task.max_steps))
     return Score(walk.solved.mean(), walk.steps.mean(), walk.moves.mean())
+
+
+STANDING = 0.5
+"""Success from which on a policy counts as one that can be lost."""
+PATIENCE = 3
+"""Evaluations in a row that must show the fall."""
+
+
+def collapsed(rows: list[dict[str, Any]], scenarios: int) -> bool:
+    """Whether a policy that could do something has lost it, and not for a moment.
+
+    True when the best evaluation solved at least half of the scenarios, and each of the last
+    three at most half as many as it, the fall being more than chance explains: four standard
+    errors of the difference of two shares of `scenarios`. Sampled actions count, since argmax
+    also fails by robots that wait for each other, which comes and goes while all is well. The
+    phases are one: they set the same scenarios. A fresh optimiser and new rewards may cost a
+    policy something at the start of a phase, which is why one low evaluation is not enough.
+    """
+    found = [row["sample"]["success"] for row in rows if "sample" in row]
+    top, last = max(found, default=0.0), found[-PATIENCE:]
+    low = min(top / 2, top - 4 * math.sqrt(0.5 / scenarios))
+    return top >= STANDING and len(last) == PATIENCE and max(last) <= low

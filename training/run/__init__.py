@@ -1,1 +1,1 @@
-"""A run: its configuration, loop, checkpoints, record."""
+"""A run: whatever is trained, in a folder, stopped and gone on with at any moment."""

@@ -1,9 +1,9 @@
 """Checkpoints that survive being killed: whole or not there, and checked when read.
 
-`checkpoints/00000120/` holds `learner/` (Orbax: parameters, optimiser, environment states,
-memory, key, update) and `about.json` (where in the run, what network, a checksum of each
-file). A folder appears under its name only when complete. The number counts updates over all
-phases.
+`checkpoints/00000120/` holds `learner/` (Orbax: the trainee's state, such as parameters,
+optimiser, environment states, memories, keys) and `about.json` (where in the run, what network, a
+checksum of each file). A folder appears under its name only when complete. The number counts
+updates over all phases.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import numpy as np
 
 from moonteam import files
 from moonteam.errors import InputError
-from training.mappo.update import Learner
 
 KEEP = 3
 
@@ -39,28 +38,43 @@ class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: dict[str, Any]
 
 
-def flatten(learner: Learner) -> dict[str, np.ndarray]:
-    """Every leaf as a host array, named by its path; the key already as its raw words."""
-    leaves = jax.tree_util.tree_flatten_with_path(learner)[0]
+def raw(state: Any) -> Any:
+    """The tree with the keys of random numbers as their words, which can be written."""
+    return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def flatten(state: Any) -> dict[str, np.ndarray]:
+    """Every leaf of a `raw` tree as a host array, named by its path."""
+    leaves = jax.tree_util.tree_flatten_with_path(state)[0]
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
-def unflatten(found: dict[str, np.ndarray], like: Learner, source: object) -> Learner:
-    """The learner again; `like` gives structure and shapes. Raises InputError if they differ."""
-    raw = like._replace(key=jax.eval_shape(jax.random.key_data, like.key))
-    leaves, structure = jax.tree_util.tree_flatten_with_path(raw)
+def unflatten(found: dict[str, np.ndarray], like: Any, source: object) -> Any:
+    """The state again, in host arrays but for its keys; `like` gives structure and shapes.
+
+    Raises InputError if they differ.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
     names = [jax.tree_util.keystr(path) for path, _ in leaves]
     if set(names) != set(found):
         odd = sorted(set(names) ^ set(found))[0]
         raise InputError(source, f"a checkpoint of another network: {odd} is in one only")
-    for name, (_, leaf) in zip(names, leaves, strict=True):
-        if found[name].shape != leaf.shape or found[name].dtype != leaf.dtype:
-            raise InputError(
-                source, f"a checkpoint of another network: {name} is "
-                f"{found[name].dtype}{list(found[name].shape)}, this run needs "
-                f"{leaf.dtype}{list(leaf.shape)}")
-    whole = jax.tree_util.tree_unflatten(structure, [jax.numpy.asarray(found[n]) for n in names])
-    return whole._replace(key=jax.random.wrap_key_data(whole.key))
+    return jax.tree_util.tree_unflatten(structure, [
+        _leaf(found[name], leaf, name, source)
+        for name, (_, leaf) in zip(names, leaves, strict=True)])
+
+
+def _leaf(array: np.ndarray, like: Any, name: str, source: object) -> Any:
+    held = jax.eval_shape(jax.random.key_data, like) if _is_key(like) else like
+    if array.shape != held.shape or array.dtype != held.dtype:
+        raise InputError(
+            source, f"a checkpoint of another network: {name} is "
+            f"{array.dtype}{list(array.shape)}, this run needs {held.dtype}{list(held.shape)}")
+    return jax.random.wrap_key_data(jax.numpy.asarray(array)) if _is_key(like) else array
 
 
 def checksums(learner: Path) -> dict[str, int]:
@@ -77,15 +91,15 @@ def place_of(folder: Path, total_updates: int) -> Path:
     return folder / f"{total_updates:08d}"
 
 
-def save(folder: Path, learner: Learner, about: About, keep: Iterable[int] = ()) -> Path:
+def save(folder: Path, state: Any, about: About, keep: Iterable[int] = ()) -> Path:
     """Writes one checkpoint; drops all but the newest few and those after so many updates.
 
-    `learner` holds host arrays, its key as raw words. Raises InputError if it cannot be written.
+    `state` holds host arrays, keys as `raw` words. Raises InputError if it cannot be written.
     """
     import orbax.checkpoint as ocp  # seconds to import, and only training needs it
 
     place = place_of(folder, about.total_updates)
-    arrays = flatten(learner)
+    arrays = flatten(state)
     partial = None
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -37,25 +37,21 @@ from moonteam.grid.types import State
 from moonteam.planners.batch import FEASIBLE
 from moonteam.policies.entity import EntitySpec, decide
 from training.mappo.gae import advantages
-from training.sharding import everywhere, mesh_for, spread
-from training.teacher.imitation import (
+from training.sharding import spread
+from training.teacher.families import (
     TIE_BREAK,
     Family,
     Ground,
-    Learner,
-    Memory,
     Sample,
     Walk,
     bare,
-    begin,
-    imitate_loss,
-    make_ground,
     on_ground,
     renew,
     solve,
-    spread_walk,
     views,
 )
+from training.teacher.imitation import imitate_loss
+from training.teacher.pupil import Learner, Pupil
 
 Reward = Literal["regret", "paper", "none"]
 
@@ -251,7 +247,6 @@ def optimiser(config: Refinement) -> optax.GradientTransformation:
 class Round(NamedTuple):
     """What a round reports."""
 
-    number: int
     loss: float
     regret: float  # mean weighted cost lost a step
     entropy: float
@@ -260,35 +255,30 @@ class Round(NamedTuple):
     imitation: float  # cross entropy of the leash
 
 
-class Refiner:
-    """A refinement in progress; `round()` until `done`, `learner.mean` is the policy."""
+class Refiner(Pupil):
+    """A refinement in progress; nothing older than a round is learned from."""
 
-    def __init__(self, config: Refinement, params: Any):
+    phase = "refinement"
+    config: Refinement
+
+    def __init__(self, config: Refinement, params: Any, name: str = "refine", source: str = ""):
         """`params`: of the imitated policy."""
-        self.config, self.number = config, 0
         envs = [config.num_envs // f.shrink for f in config.families]
-        self.mesh = mesh_for([*envs, *(e * config.num_steps // config.minibatches for e in envs)])
-        params, mean = jax.tree.map(jnp.array, params), jax.tree.map(jnp.array, params)
-        self.learner = everywhere(self.mesh, Learner(params, mean, optimiser(config).init(params)))
-        self.grounds = [everywhere(self.mesh, make_ground(f, config.seed + i))
-                        for i, f in enumerate(config.families)]
         keys = jax.random.split(jax.random.key(config.seed + 1_000_003), len(config.families))
-        self.walks = [spread_walk(self.mesh, begin(f, g, k, config.num_envs // f.shrink))
-                      for f, g, k in
-                      zip(config.families, self.grounds, keys, strict=True)]
-
-        self.memories: list[Memory] = []  # nothing older than a round is learned from
-
-    @property
-    def done(self) -> bool:
-        """All rounds are made."""
-        return self.number >= self.config.rounds
+        super().__init__(config, name, source, Learner.begin(params, optimiser(config)), keys, envs,
+                         [*envs, *(e * config.num_steps // config.minibatches for e in envs)])
+        self.method = f"MAPPO from imitation, reward {config.reward}"
 
     @property
     def states_a_round(self) -> int:
         """States visited and labelled in a round."""
         config = self.config
         return sum(config.num_envs // f.shrink * config.num_steps for f in config.families)
+
+    @property
+    def steps_a_round(self) -> int:
+        """Every state is labelled."""
+        return self.states_a_round
 
     def round(self) -> Round:
         """Collects, asks the planner and learns, each family once."""
@@ -307,7 +297,7 @@ class Refiner:
                     losses.append(report)
         self.number += 1
         total, entropy, clipped, critic, near = np.mean(jax.device_get(losses), axis=0).tolist()
-        return Round(self.number, total, float(np.mean(lost)), entropy, clipped, critic, near)
+        return Round(total, float(np.mean(lost)), entropy, clipped, critic, near)
 
     def _experience(self, i: int) -> tuple[Walk, Minibatch, float]:
         """One rollout of a family, with advantages and labels."""

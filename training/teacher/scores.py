@@ -18,7 +18,7 @@ from moonteam.grid import env
 from moonteam.planners.batch import solve_batch
 from moonteam.policies.entity import EntitySpec, decide
 from training.mappo.held_out import HELD_OUT_SEED
-from training.teacher.imitation import (
+from training.teacher.families import (
     Family,
     Ground,
     Walk,

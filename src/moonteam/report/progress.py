@@ -34,7 +34,7 @@ def bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int, str], 
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     # The estimate must outlive a long silence: a chunk of training can take minutes.
-    with Progress(TextColumn("{task.description}"), BarColumn(bar_width=20),
+    with Progress(TextColumn("{task.description}"), BarColumn(bar_width=10),
                   TimeRemainingColumn(), TextColumn("{task.fields[words]}"),
                   console=Console(stderr=True), transient=True,
                   speed_estimate_period=1800) as progress:

@@ -10,8 +10,8 @@ from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.policies.recurrent import Recurrent
 from training.bench import measure, ours, peer
+from training.bench.jaxmarl_task import JaxmarlTask
 from training.mappo import rollout
-from training.mappo.jaxmarl_task import JaxmarlTask
 from training.mappo.networks import Networks
 
 SPREAD = "MPE_simple_spread_v3"

@@ -5,7 +5,7 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
-from training.run.config import PRESETS, Phase, preset
+from training.mappo.config import PRESETS, Phase, preset
 
 
 def dry_run(capsys, *words):

@@ -7,8 +7,8 @@ import numpy as np
 from moonteam.grid.config import EnvConfig
 from moonteam.policies.recurrent import RecurrentSpec
 from training.mappo import networks, rollout, update
+from training.mappo.config import preset
 from training.mappo.grid_task import GridTask
-from training.run.config import preset
 
 SPEC = RecurrentSpec(2, 2, (4, 4), width=8)
 NETS = networks.for_spec(SPEC)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from moonteam import files
 from moonteam.cli import main
-from training.run.config import PRESETS
+from training.mappo.config import PRESETS
 
 
 def score(success, makespan=10.0):
@@ -97,11 +97,12 @@ def test_tables_and_curves(runs, tmp_path, capsys):
 def test_the_mean_line_ends_where_the_shortest_run_does(runs):
     from matplotlib.figure import Figure
 
-    from training.run import record
+    from training.mappo import curve
+    from training.run import metrics
 
     axis = Figure().subplots()
-    group = [record.read(Path(name) / "metrics.jsonl") for name in runs[3:]]
-    record._draw_group(axis, "success", "Dense", group, "C0")
+    group = [metrics.read(Path(name) / "metrics.jsonl") for name in runs[3:]]
+    curve._draw_group(axis, "success", "Dense", group, "C0")
     mean, low, high, dotted = axis.lines
     assert list(mean.get_xdata()) == list(dotted.get_xdata()) == [200, 400]
     assert list(mean.get_ydata()) == pytest.approx([(0.5 / 3 + 0.2) / 2, (1.0 / 3 + 0.4) / 2])
@@ -151,3 +152,21 @@ def test_a_half_written_last_line_is_left_out(tmp_path, capsys):
     with (tmp_path / "run" / "metrics.jsonl").open("a") as out:
         out.write('{"phase": "refin')
     assert compare(capsys, path)["summary"][0]["argmax_success"] == pytest.approx(0.9)
+
+
+def test_two_kinds_are_not_in_one_table(tmp_path, capsys):
+    mappo = folder(tmp_path / "run", 0.9)
+    taught = tmp_path / "taught"
+    look = {"family": "2 robots", "success": 0.5, "makespan_gap": 0.2, "success_effort": 0.4,
+            "moves_gap": 0.1}
+    files.write_json(taught / "config.json", {"preset": "quick", "seed": 3, "families": []})
+    files.write_text(taught / "metrics.jsonl", files.dump_json(
+        {"phase": "imitation", "env_steps": 6, "seconds": 1.0, "labelled": 3,
+         "families": [look, look | {"success": 1.0}]}) + "\n")
+    assert main(["train", "compare", mappo, str(taught)]) == 2
+    assert "quick is judged by other figures than small" in capsys.readouterr().err
+    out = tmp_path / "out"
+    assert main(["train", "compare", str(taught), "--out", str(out)]) == 0
+    (row,) = json.loads((out / "compare.json").read_text())["summary"]
+    assert (row["success"], row["moves_gap"], row["env_steps"]) == (0.75, 0.1, 6)
+    assert (out / "curves.png").stat().st_size > 0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from moonteam.cli import main
-from tests.training.run.test_loop import words
+from tests.training.run.test_machine import words
 
 FIGURES = ("success", "makespan", "moves", "mean_reward", "value_loss", "entropy")
 

@@ -6,14 +6,18 @@ import jax
 import numpy as np
 import pytest
 
+from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.policies import entity
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.policy_file import PolicyFile, load_policy, save_policy
+from tests.training.killed import kill_when_saved
 from training.commands import refine
-from training.run import folder
-from training.run.folder import Run
-from training.run.loop import Stop
-from training.teacher.imitation import TIE_BREAK, Family
+from training.run import metrics
+from training.run.machine import Run, Stop
+from training.teacher import presets, pupil
+from training.teacher.families import TIE_BREAK, Family
+from training.teacher.imitation import Imitation
 from training.teacher.refinement import Refinement, Refiner, collect, judge, regrets
 
 SMALL = Family(2, 2, sides=(3, 4), max_steps=24)
@@ -65,27 +69,54 @@ def test_a_team_that_stands_still_loses_the_step():
 def test_learning_lowers_the_regret(reward):
     refiner = Refiner(dataclasses.replace(TINY, reward=reward), PARAMS)
     lost = [refiner.round().regret for _ in range(TINY.rounds)]
-    assert refiner.done
+    assert refiner.number == TINY.rounds
     assert np.isfinite(lost).all()
     if reward != "paper":
         assert np.mean(lost[-8:]) < 0.9 * np.mean(lost[:8])
 
 
 def test_a_resumed_run_is_the_same_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(folder, "SCENARIOS", 8)
+    monkeypatch.setattr(pupil, "SCENARIOS", 8)
     config = dataclasses.replace(TINY, rounds=4)
-    whole = Run("refine", "test", Refiner(config, PARAMS), tmp_path / "whole", False, "here")
+    whole = Run(Refiner(config, PARAMS, source="here"), tmp_path / "whole", False)
     assert whole.train(Stop())
-    begun = Run("refine", "test", Refiner(config, PARAMS), tmp_path / "parts", False, "here")
-    begun.work.round()
-    begun.save()
-    again = Run("refine", "test", Refiner(config, PARAMS), tmp_path / "parts", True, "here")
-    assert again.work.number == 1
+    begun = Run(Refiner(config, PARAMS, source="here"), tmp_path / "parts", False)
+    assert not begun.train(Stop(), stop_after=1)
+    again = Run(Refiner(config, PARAMS, source="here"), tmp_path / "parts", True)
+    assert again.trainee.number == 1
     assert again.train(Stop())
-    for a, b in zip(jax.tree.leaves(whole.work.learner), jax.tree.leaves(again.work.learner),
-                    strict=True):
+    learners = [jax.tree.leaves(run.trainee.learner) for run in (whole, again)]
+    for a, b in zip(*learners, strict=True):
         np.testing.assert_array_equal(a, b)
-    assert again.finish()["method"] == "test"
+    assert again.finish()["method"] == "MAPPO from imitation, reward regret"
+
+
+SMALLER = ("from training.teacher import pupil; pupil.SCENARIOS = 8; "
+           "from tests.training.teacher.test_refinement import PRACTISED; "
+           "from training.teacher.presets import PRESETS; PRESETS['quick'] = PRACTISED; ")
+PRACTISED = Imitation(families=(SMALL, Family(3, 2, sides=(4, 4), max_steps=24, grounds=3)))
+
+
+def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch):
+    monkeypatch.setattr(pupil, "SCENARIOS", 8)
+    monkeypatch.setitem(presets.PRESETS, "quick", PRACTISED)
+    begun = tmp_path / "begun.safetensors"
+    save_policy(begun, PolicyFile("entity", dataclasses.asdict(SPEC), jax.device_get(PARAMS), {},
+                                  "none"))
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    words = ["train", "refine", str(begun), "--families", "quick", "--rounds", "5",
+             "--checkpoint-seconds", "0", "--out"]
+    assert main([*words, str(whole)]) == 0
+    kill_when_saved(parts, [*words, str(parts)], SMALLER)
+    assert main([*words, str(parts), "--resume", "--beside", str(whole)]) == 0
+    before, after = (load_policy(out / "policy.safetensors").params for out in (whole, parts))
+    for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        np.testing.assert_array_equal(a, b)
+    rows = [metrics.read(out / "metrics.jsonl") for out in (whole, parts)]
+    assert [row["total_updates"] for row in rows[1]] == list(range(6))
+    for key in ("regret", "families", "labelled"):
+        assert [row.get(key) for row in rows[0]] == [row.get(key) for row in rows[1]]
+    assert (parts / "beside.png").stat().st_size > 0
 
 
 def test_impossible_numbers(tmp_path):

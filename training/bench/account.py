@@ -17,11 +17,11 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.policies import recurrent
 from training.mappo import networks, rollout, update
+from training.mappo.config import Config, Phase
 from training.mappo.grid_task import GridTask
 from training.mappo.hyper import Hyper
 from training.mappo.networks import Networks
 from training.mappo.update import Learner
-from training.run.config import Config, Phase
 
 GIB = 2**30
 

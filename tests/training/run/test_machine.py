@@ -16,9 +16,12 @@ import pytest
 from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.grid import env
-from training.run import checkpoints, loop, record
-from training.run.config import BOOTSTRAP, REFINEMENT, Config, Phase
-from training.run.loop import Run, Stop
+from tests.training.killed import kill_when_saved
+from training.mappo import update
+from training.mappo.config import BOOTSTRAP, REFINEMENT, Config, Phase
+from training.mappo.trainee import Mappo
+from training.run import checkpoints, machine, metrics
+from training.run.machine import Run, Stop, stop_on_signals
 
 TINY = Config(
     "small", Phase(4, 8, 2, BOOTSTRAP), Phase(6, 8, 2, REFINEMENT), num_agents=2, num_targets=2,
@@ -40,7 +43,7 @@ def words(out, *more):
 
 
 def bits(run):
-    return jax.tree.leaves(jax.device_get(run.learner.params))
+    return jax.tree.leaves(jax.device_get(run.trainee.learner.params))
 
 
 def same(one, other):
@@ -50,7 +53,7 @@ def same(one, other):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """An uninterrupted run."""
-    run = Run(TINY, tmp_path_factory.mktemp("whole"), resume=False)
+    run = Run(Mappo(TINY), tmp_path_factory.mktemp("whole"), resume=False)
     assert run.train(Stop())
     return run
 
@@ -58,9 +61,9 @@ def whole(tmp_path_factory):
 def stopped(out, *at):
     """A run stopped after so many updates, and gone on with, each time from disk."""
     for number, updates in enumerate(at):
-        run = Run(TINY, out, resume=number > 0)
+        run = Run(Mappo(TINY), out, resume=number > 0)
         assert not run.train(Stop(), stop_after=updates)
-    return Run(TINY, out, resume=bool(at))
+    return Run(Mappo(TINY), out, resume=bool(at))
 
 
 def test_resumed_twice_is_bit_identical(whole, tmp_path):
@@ -75,7 +78,7 @@ def test_resumed_twice_is_bit_identical(whole, tmp_path):
 
 
 def test_another_seed_is_another_run(whole, tmp_path):
-    run = Run(dataclasses.replace(TINY, seed=1), tmp_path, resume=False)
+    run = Run(Mappo(dataclasses.replace(TINY, seed=1)), tmp_path, resume=False)
     run.train(Stop())
     assert not same(bits(run), bits(whole))
 
@@ -83,12 +86,12 @@ def test_another_seed_is_another_run(whole, tmp_path):
 def test_refinement_keeps_the_weights_and_takes_a_fresh_optimiser(tmp_path):
     run = stopped(tmp_path, 4)
     before = bits(run)
-    run.learner = run.begin(1, run.learner.params)
+    run.trainee.enter("refinement")
     assert same(bits(run), before)
-    counts = [leaf for leaf in jax.tree.leaves(run.learner.optimiser) if leaf.ndim == 0]
+    counts = [leaf for leaf in jax.tree.leaves(run.trainee.learner.optimiser) if leaf.ndim == 0]
     assert counts
     assert all(int(count) == 0 for count in counts)
-    weights = [run.task(phase).config.weights for _, phase in TINY.phases]
+    weights = [run.trainee.task(phase).config.weights for _, phase in TINY.phases]
     assert [(w.SC, w.TC, w.TB) for w in weights] == [(0, 0, 0), (0.3, 0.5, 0.2)]
 
 
@@ -110,27 +113,17 @@ def test_a_torn_checkpoint_is_passed_over_with_a_warning(whole, tmp_path, harm):
     else:
         (newest / "about.json").write_text('{"phase": "refi')
     with pytest.warns(UserWarning, match="00000006 is torn"):
-        run = Run(TINY, tmp_path, resume=True)
+        run = Run(Mappo(TINY), tmp_path, resume=True)
     assert run.position.total_updates == 4  # saved for its evaluation, the best until then
     assert run.train(Stop())
     assert same(bits(run), bits(whole))
 
 
 def test_killed_and_resumed_is_bit_identical(whole, tmp_path):
-    """SIGKILL once a checkpoint is there, wherever the process then is."""
-    command = [sys.executable, "-m", "moonteam.cli", *words(tmp_path, "--checkpoint-seconds", "0")]
-    child = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"},
-                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    deadline = time.monotonic() + 300
-    while checkpoints.newest(tmp_path / "checkpoints") is None:
-        assert child.poll() is None, child.communicate()[1].decode()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    child.send_signal(signal.SIGKILL)
-    child.communicate()
+    kill_when_saved(tmp_path, words(tmp_path, "--checkpoint-seconds", "0"))
     assert main(words(tmp_path, "--resume", "--checkpoint-seconds", "0", "--tensorboard")) == 0
     assert list(tmp_path.glob("events.out.tfevents.*"))
-    run = Run(TINY, tmp_path, resume=True)
+    run = Run(Mappo(TINY), tmp_path, resume=True)
     assert run.position.total_updates == 10
     assert same(bits(run), bits(whole))
     for name in ("config.json", "metrics.jsonl", "report.json", "curve.png", "policy.safetensors"):
@@ -145,9 +138,9 @@ def test_sigterm_while_training_saves_and_the_run_goes_on_from_there(tmp_path):
                *words(tmp_path, "--checkpoint-seconds", "1e6", *endless)]
     child = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"},
                              stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    metrics = tmp_path / "metrics.jsonl"
+    lines = tmp_path / "metrics.jsonl"
     deadline = time.monotonic() + 300
-    while len(record.read(metrics)) < 3:
+    while len(metrics.read(lines)) < 3:
         assert child.poll() is None, child.communicate()[1].decode()
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -155,29 +148,29 @@ def test_sigterm_while_training_saves_and_the_run_goes_on_from_there(tmp_path):
     child.send_signal(signal.SIGTERM)
     line = child.communicate(timeout=300)[1].decode()
     assert child.returncode == 130, line
-    done = record.read(metrics)[-1]["total_updates"]
+    done = metrics.read(lines)[-1]["total_updates"]
     assert f"interrupted after update {done}, saved; go on with --out {tmp_path} --resume" in line
     assert checkpoints.newest(tmp_path / "checkpoints").name == f"{done:08d}"
     config = dataclasses.replace(
         TINY, eval_every=1000000, bootstrap=dataclasses.replace(TINY.bootstrap, updates=1000000))
-    run = Run(config, tmp_path, resume=True)
+    run = Run(Mappo(config), tmp_path, resume=True)
     assert run.position.total_updates == done
     assert not run.train(Stop(), stop_after=done + 2)
-    updates = [row["total_updates"] for row in record.read(metrics)]
+    updates = [row["total_updates"] for row in metrics.read(lines)]
     assert updates == list(range(2, done + 3, 2))
 
 
 def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     for number in (signal.SIGTERM, signal.SIGINT):
-        with loop.stop_on_signals() as stop:
+        with stop_on_signals() as stop:
             assert not stop.asked
             os.kill(os.getpid(), number)
             assert stop.asked
     assert signal.getsignal(signal.SIGTERM) is before
-    run = Run(TINY, tmp_path, resume=False)
+    run = Run(Mappo(TINY), tmp_path, resume=False)
     run.train(Stop(), stop_after=2)
-    again = Run(TINY, tmp_path, resume=True)
+    again = Run(Mappo(TINY), tmp_path, resume=True)
     assert not again.train(Stop(asked=True))
     assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
 
@@ -190,64 +183,25 @@ def test_an_interrupted_command_saves_and_returns_130(tmp_path, monkeypatch, cap
 
 def test_not_a_number_names_the_last_good_checkpoint(tmp_path, capsys):
     run = stopped(tmp_path, 2)
-    poisoned = jax.tree.map(lambda x: x * np.nan, run.learner.params)
-    run.learner = run.learner._replace(params=poisoned)
-    with pytest.raises(loop.Diverged, match=r"not a number; .*checkpoints/00000002"):
+    poisoned = jax.tree.map(lambda x: x * np.nan, run.trainee.learner.params)
+    run.trainee.learner = run.trainee.learner._replace(params=poisoned)
+    with pytest.raises(machine.Diverged, match=r"not a number; .*checkpoints/00000002"):
         run.train(Stop())
     assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
 
 
 def test_weights_spoiled_by_a_chunks_last_step_are_not_saved_as_good(tmp_path, monkeypatch):
     run = stopped(tmp_path, 2)
-    real = loop.update.chunk
+    real = update.chunk
 
     def spoiled(*args):
         learner, report = real(*args)
         return learner._replace(params=jax.tree.map(lambda x: x * np.nan, learner.params)), report
 
-    monkeypatch.setattr(loop.update, "chunk", spoiled)
-    with pytest.raises(loop.Diverged, match="weight is not a number"):
+    monkeypatch.setattr(update, "chunk", spoiled)
+    with pytest.raises(machine.Diverged, match="weight is not a number"):
         run.train(Stop())
     assert checkpoints.newest(tmp_path / "checkpoints").name == "00000002"
-
-
-def looks(*successes):
-    """Rows with evaluations of sampled actions, one every ten updates."""
-    return [{"total_updates": 10 * i, "sample": {"success": s}} for i, s in enumerate(successes, 1)]
-
-
-SMALL = looks(.633, .645, .656, .719, .754, .730, .820, .879, .895, .906, .895, .938, .941, .941,
-              .926, .930, .953, .984, .988, .988, .980, .996, .988, .992)
-"""What `moonteam train small --seed 0` shows."""
-
-
-@pytest.mark.parametrize(("successes", "scenarios", "expected"), [
-    ((0.9, 0.45, 0.4, 0.3), 256, True),
-    ((0.6, 0.9, 0.0, 0.0, 0.0), 256, True),
-    ((0.9, 0.9, 0.3, 0.3), 256, False),  # two only
-    ((0.9, 0.3, 0.3, 0.5, 0.3), 256, False),  # not in a row
-    ((0.9, 0.46, 0.4, 0.3), 256, False),  # more than half of the best
-    ((0.45, 0.1, 0.1, 0.1), 256, False),  # never could do much
-    ((0.6, 0.29, 0.29, 0.29), 16, False),  # chance, on so few scenarios
-    ((0.1, 0.1, 0.1, 0.1), 256, False)])
-def test_a_collapse_is_a_lasting_fall_to_half_of_what_it_could(successes, scenarios, expected):
-    assert record.collapsed(looks(*successes), scenarios) is expected
-
-
-def test_no_false_alarm_in_normal_learning():
-    assert not any(record.collapsed(SMALL[:n], 256) for n in range(len(SMALL) + 1))
-    training = [{"total_updates": n} for n in range(3)]
-    assert not record.collapsed(training, 256)
-    draw = np.random.default_rng(0)
-    for scenarios in (4, 8, 16, 32, 256):  # one policy, measured again and again
-        for ability in (0.3, 0.5, 0.7, 0.95):
-            noisy = looks(*(draw.binomial(scenarios, ability, 400) / scenarios))
-            assert not any(record.collapsed(noisy[:n], scenarios) for n in range(1, 401, 3))
-
-
-def test_the_last_of_equally_good_evaluations_is_the_best():
-    assert record.best(looks(0.5, 0.8, 0.8, 0.7))["total_updates"] == 30
-    assert record.best([{"total_updates": 5}]) is None
 
 
 def test_a_lost_policy_stops_the_run_and_the_best_checkpoint_is_left(tmp_path):
@@ -255,22 +209,22 @@ def test_a_lost_policy_stops_the_run_and_the_best_checkpoint_is_left(tmp_path):
     easy = dataclasses.replace(
         TINY, bootstrap=Phase(40, 8, 2, BOOTSTRAP, lr=1e-5), max_steps=48, eval_every=1,
         eval_scenarios=64, refinement=dataclasses.replace(TINY.refinement, updates=0))
-    run = Run(easy, tmp_path, resume=False, checkpoint_seconds=0)
+    run = Run(Mappo(easy), tmp_path, resume=False, checkpoint_seconds=0)
     run.train(Stop(), stop_after=4)
-    good = record.best(run.metrics.rows)
+    good = run.best()
     assert good["sample"]["success"] > 0.6
-    params = run.learner.params
+    params = run.trainee.learner.params
     lame = jax.tree.map(lambda x: x.at[env.STAY].add(100.0) if x.shape == (env.NUM_ACTIONS,) else x,
                         params.actor)  # the bias of the logits
-    run.learner = run.learner._replace(params=params._replace(actor=lame))
-    with pytest.raises(loop.Diverged, match=r"collapsed by update 10 .*sampled actions solve 0\.0"):
+    run.trainee.learner = run.trainee.learner._replace(params=params._replace(actor=lame))
+    with pytest.raises(machine.Diverged, match=r"by update 10 .*sampled actions solve 0\.0"):
         run.train(Stop())
     before = tmp_path / "checkpoints" / f"{good['total_updates']:08d}"
     assert before.is_dir()
     fresh = tmp_path / "fresh"  # to go on from it: a folder that holds nothing else
     (fresh / "checkpoints").mkdir(parents=True)
     before.rename(fresh / "checkpoints" / before.name)
-    again = Run(dataclasses.replace(easy, gamma=0.9), fresh, resume=True)
+    again = Run(Mappo(dataclasses.replace(easy, gamma=0.9)), fresh, resume=True)
     assert again.position.total_updates == good["total_updates"]
 
 
@@ -281,7 +235,7 @@ def test_a_collapse_ends_the_command_with_one_unless_told_otherwise(tmp_path, mo
         score = {"success": next(scores), "makespan": 8.0, "moves": 9.0}
         return {"argmax": score, "sample": score}
 
-    monkeypatch.setattr(Run, "evaluate", evaluate)
+    monkeypatch.setattr(Mappo, "evaluate", evaluate)
     often = ("--eval-every", "1", "--eval-scenarios", "256", "--checkpoint-seconds", "0")
     assert main(words(tmp_path / "a", *often)) == 1
     line = capsys.readouterr().err
@@ -300,30 +254,30 @@ def test_a_collapse_ends_the_command_with_one_unless_told_otherwise(tmp_path, mo
 def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
     stopped(tmp_path, 2)
     with pytest.raises(InputError, match="already holds a run"):
-        Run(TINY, tmp_path, resume=False)
+        Run(Mappo(TINY), tmp_path, resume=False)
     with pytest.raises(InputError, match="gamma: was started with other numbers"):
-        Run(dataclasses.replace(TINY, gamma=0.9), tmp_path, resume=True)
+        Run(Mappo(dataclasses.replace(TINY, gamma=0.9)), tmp_path, resume=True)
 
 
 def test_beginning_where_another_runs_bootstrap_ended(whole, tmp_path):
     """The same numbers end with the same bits; others change what comes after, and only that."""
     end = whole.out / "checkpoints" / "00000004"
-    twin = Run(TINY, tmp_path / "twin", resume=False, begin=end)
+    twin = Run(Mappo(TINY), tmp_path / "twin", resume=False, begin=end)
     assert twin.position.total_updates == 4
     assert (tmp_path / "twin/checkpoints/00000004").is_dir()
     assert twin.train(Stop())
     assert same(bits(twin), bits(whole))
-    rows = [record.read(run.out / "metrics.jsonl") for run in (twin, whole)]
+    rows = [metrics.read(run.out / "metrics.jsonl") for run in (twin, whole)]
     assert [r["success"] for r in rows[0]] == [r["success"] for r in rows[1]]
 
     weights = dataclasses.replace(REFINEMENT, AR=0.0)
     refinement = dataclasses.replace(TINY.refinement, weights=weights)
     quick = dataclasses.replace(TINY, refinement=refinement)
-    other = Run(quick, tmp_path / "other", resume=False, begin=end)
-    assert same(bits(other), bits(Run(TINY, tmp_path / "start", resume=False, begin=end)))
+    other = Run(Mappo(quick), tmp_path / "other", resume=False, begin=end)
+    assert same(bits(other), bits(Run(Mappo(TINY), tmp_path / "start", resume=False, begin=end)))
     other.train(Stop(), stop_after=6)
     assert (tmp_path / "other/checkpoints/00000004").is_dir()
-    again = Run(quick, tmp_path / "other", resume=True)
+    again = Run(Mappo(quick), tmp_path / "other", resume=True)
     assert again.train(Stop())
     assert not same(bits(again), bits(whole))
 
@@ -354,9 +308,9 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path):
     wider = dataclasses.replace(TINY, width=16)
     (tmp_path / "config.json").unlink()
     with pytest.raises(InputError, match="another network"):
-        Run(wider, tmp_path, resume=True)
+        Run(Mappo(wider), tmp_path, resume=True)
     arrays = checkpoints.load(tmp_path / "checkpoints")[1]
-    like = jax.eval_shape(lambda: Run(wider, tmp_path / "w", resume=False).begin(0, None))
+    like = jax.eval_shape(lambda: Mappo(wider).begin("bootstrap", None))
     with pytest.raises(InputError, match=r"another network.*this run needs"):
         checkpoints.unflatten(arrays, like, "here")
 
@@ -373,3 +327,13 @@ def test_a_full_disk_names_the_checkpoint_before(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000002"]
     assert checkpoints.load(tmp_path / "checkpoints")[0].total_updates == 2
+
+
+def test_a_checkpoint_of_an_earlier_version_is_one_line(tmp_path):
+    earlier = tmp_path / "checkpoints" / "state.npz"
+    earlier.parent.mkdir()
+    earlier.write_bytes(b"PK")
+    with pytest.raises(InputError, match="already holds a run"):
+        Run(Mappo(TINY), tmp_path, resume=False)
+    with pytest.raises(InputError, match=r"state\.npz: is a checkpoint of an earlier version"):
+        Run(Mappo(TINY), tmp_path, resume=True)

@@ -2,14 +2,12 @@
 
 import struct
 import sys
-from io import StringIO
 
 import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
-from training.run import record
-from training.run.config import PRESETS
+from training.run import metrics
 
 SCORE = {"success": 0.987, "makespan": 14.25, "moves": 26.5}
 
@@ -38,10 +36,10 @@ def events(folder):
 
 
 def test_tensorboard_gets_every_number_of_every_row(tmp_path):
-    metrics = record.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
-    metrics.add(row(1))
-    metrics.add(row(2, argmax=SCORE, sample=SCORE))
-    metrics.close()
+    written = metrics.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
+    written.add(row(1))
+    written.add(row(2, argmax=SCORE, sample=SCORE))
+    written.close()
     found, _ = events(tmp_path)
     assert ("success", 100, 0.75) in found
     assert ("sample/makespan", 200, 14.25) in found
@@ -50,11 +48,11 @@ def test_tensorboard_gets_every_number_of_every_row(tmp_path):
 
 
 def test_resumed_events_go_on_where_the_rows_do(tmp_path):
-    first = record.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
+    first = metrics.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
     for updates in (1, 2, 3):
         first.add(row(updates))
     first.close()
-    again = record.Metrics(tmp_path / "metrics.jsonl", 2, tensorboard=True)
+    again = metrics.Metrics(tmp_path / "metrics.jsonl", 2, tensorboard=True)
     again.add(row(3, success=0.5))
     again.close()
     found, void = events(tmp_path)
@@ -70,31 +68,22 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path, monkeypatch
     assert error.count("\n") == 1
     assert not (tmp_path / "run").exists()
     with pytest.raises(InputError, match="is not installed"):
-        record.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
-    record.Metrics(tmp_path / "metrics.jsonl", 0).add(row(1))
+        metrics.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
+    metrics.Metrics(tmp_path / "metrics.jsonl", 0).add(row(1))
 
 
-@pytest.mark.parametrize("name", ["small", "pi_5t5r"])
-def test_the_live_lines_show_everything_on_80_columns(name):
-    from rich.console import Console
-
-    screen = StringIO()
-    console = Console(file=screen, force_terminal=True, width=80, color_system=None)
-    progress = record.Progress(PRESETS[name], 0, console)
-    scores = {"argmax": SCORE | {"makespan": 113.62}, "sample": SCORE}
-    for steps, more in ((5_000_000_000, scores), (6_000_000_000, {})):
-        progress.show(row(1, phase="refinement", **more) | {"env_steps": steps})
-    progress.stop()
-    shown = screen.getvalue()
-    last = shown[shown.rindex(name):]
-    for part in ("refinement", "6,000,000,000 env steps", "23,457/s", "0.987 success",
-                 "113.6 makespan", "26.5 moves", "0:00:0"):
-        assert part in last, last
-    assert "…" not in last
+def test_scores_of_a_list_are_numbered():
+    looked = row(1, families=[{"family": "two", "success": 0.5}, {"family": "three", "success": 1}])
+    found = metrics.scalars(looked)
+    assert (found["families/0/success"], found["families/1/success"]) == (0.5, 1)
+    assert not any(name.endswith("/family") for name in found)
 
 
-def test_no_terminal_no_line(capsys):
-    progress = record.Progress(PRESETS["small"], 0)
-    progress.show(row(1, argmax=SCORE))
-    progress.stop()
-    assert capsys.readouterr() == ("", "")
+def test_the_last_of_equally_good_evaluations_is_the_best():
+    rows = [row(10 * i, sample={"success": s}) for i, s in enumerate((0.5, 0.8, 0.8, 0.7), 1)]
+
+    def score(row):
+        return row["sample"]["success"] if "sample" in row else None
+
+    assert metrics.best(rows, score)["total_updates"] == 30
+    assert metrics.best([row(5)], score) is None

@@ -1,0 +1,63 @@
+"""What the commands that train share: the options of a run, and its end."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from moonteam import files
+from moonteam.commands.options import Printed, RunFolder, Seeded
+from moonteam.report.command import Aside
+from training.run.machine import Diverged, Run, stop_on_signals
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watched(RunFolder, Printed):
+    """How a run is kept and watched."""
+
+    checkpoint_seconds: Aside[float] = 30.0
+    """Seconds between two checkpoints; a chunk of updates is never cut."""
+    tensorboard: Aside[bool] = False
+    """Write the metrics as TensorBoard events into the run folder too; needs
+    pip install 'moonteam[tensorboard]'."""
+
+    def folder(self, name: str, seed: int) -> Path:
+        """That given, or the one that this run is known by.
+
+        Raises InputError if TensorBoard is asked for and missing, before anything is written.
+        """
+        if self.tensorboard:
+            from training.run.metrics import tensorboard_writer
+
+            tensorboard_writer()
+        return self.out or Path("runs") / f"{name}-{seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taught(Seeded, Watched):
+    """The same for imitation and refinement."""
+
+    checkpoint_seconds: Aside[float] = 60.0
+    """Seconds between two checkpoints, which hold all labelled states; a round is never cut."""
+
+
+def complete(run: Run, json: bool) -> int:
+    """Trains to the end, or until stopped, and reports; returns the exit code."""
+    try:
+        with stop_on_signals() as stop:
+            finished = run.train(stop)
+    except Diverged as error:
+        print(f"moonteam: {error}", file=sys.stderr)
+        return 1
+    if not finished:
+        print(f"moonteam: interrupted after {run.trainee.unit} {run.position.total_updates}, "
+              f"saved; go on with --out {run.out} --resume", file=sys.stderr)
+        return 130
+    report = run.finish()
+    if json:
+        print(files.dump_json(report | {"out": str(run.out), "config": run.trainee.recipe}))
+    *lines, spent = run.trainee.lines(report)
+    print(*lines, f"{spent}; policy, curve and report in {run.out}", sep="\n",
+          file=sys.stderr if json else sys.stdout)
+    return 0

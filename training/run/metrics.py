@@ -1,0 +1,93 @@
+"""What a run writes down while it goes: `metrics.jsonl`, and TensorBoard's events if asked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from moonteam import files
+from moonteam.errors import InputError
+from training.run.trainee import Row
+
+
+class Metrics:
+    """Appends one JSON object a chunk to `metrics.jsonl`, and its numbers to TensorBoard's events.
+
+    `close` at the end.
+    """
+
+    def __init__(self, path: Path, resumed_updates: int, tensorboard: bool = False,
+                 earlier: Path | None = None):
+        """Keeps the lines of an earlier stretch up to `resumed_updates`, drops later ones.
+
+        `earlier`: where that stretch is, if in another file.
+        Raises InputError if TensorBoard is asked for and its writer is not installed.
+        """
+        writer = tensorboard_writer() if tensorboard else None
+        self.path, self.events = path, None
+        self.rows = [row for row in read(earlier or path)
+                     if row["total_updates"] <= resumed_updates]
+        files.write_text(path, "".join(files.dump_json(row) + "\n" for row in self.rows))
+        if writer:
+            done = self.rows[-1]["env_steps"] if self.rows else 0
+            # What an earlier stretch wrote from here on is hidden: it is trained anew.
+            self.events = writer(str(path.parent), purge_step=done + 1)
+
+    def add(self, row: Row) -> None:
+        """One more line, on disk at once."""
+        self.rows.append(row)
+        with self.path.open("a", encoding="utf-8") as out:
+            out.write(files.dump_json(row) + "\n")
+        if self.events:
+            for name, value in scalars(row).items():
+                self.events.add_scalar(name, value, row["env_steps"])
+            self.events.flush()
+
+    def close(self) -> None:
+        """Nothing is added after this."""
+        if self.events:
+            self.events.close()
+
+
+def tensorboard_writer() -> Any:
+    """The class that writes TensorBoard's events. Raises InputError if it is not installed."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise InputError("--tensorboard", "needs tensorboardX, which is not installed: "
+                         "pip install 'moonteam[tensorboard]'") from None
+    return SummaryWriter
+
+
+def scalars(row: dict[Any, Any], prefix: str = "") -> dict[str, float]:
+    """The numbers of a row by name; those of a held-out score as argmax/success and so on, those of
+    a list families/0/success.
+    """
+    found: dict[str, float] = {}
+    for key, value in row.items():
+        if isinstance(value, list):
+            value = dict(enumerate(value))
+        if isinstance(value, dict):
+            found |= scalars(value, f"{prefix}{key}/")
+        elif isinstance(value, (int, float)):
+            found[f"{prefix}{key}"] = value
+    return found
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a metrics file; a half-written last line is left out."""
+    rows = []
+    for line in files.read_text(path).splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def best(rows: list[Row], score: Callable[[Row], float | None]) -> Row | None:
+    """The row of the highest score; the last of equals, None where no row has one."""
+    scored = [(row, value) for row in rows if (value := score(row)) is not None]
+    return max(reversed(scored), key=lambda pair: pair[1], default=(None, 0.0))[0]
