@@ -233,7 +233,8 @@ class Pupil(ABC):
     def report(self, rows: list[Row]) -> dict[str, Any]:
         """The last evaluation."""
         left_out = {field.name for field in dataclasses.fields(Position)} | {"rate"}
-        return {"method": self.method} | {k: v for k, v in rows[-1].items() if k not in left_out}
+        last = {k: v for k, v in rows[-1].items() if k not in left_out}
+        return {"method": self.method, "scenarios": SCENARIOS} | last
 
     def lines(self, report: dict[str, Any]) -> list[str]:
         """A line a family."""
