@@ -82,14 +82,14 @@ def _decider(args: Args) -> tuple[Decider, Any]:
         return FirstOpen(), None
     if args.planner == "policy":
         from moonteam import paths
-        from moonteam.planners.learned import Policy
+        from moonteam.policies.policy import Policy
 
         policy = Policy.load(paths.find(args.policy, "policies", ".safetensors"))
         return PolicyDecider(policy.brain), policy.params
     import jax
 
-    from moonteam.planners.learned import EntityBrain
     from moonteam.policies import entity
+    from moonteam.policies.brain import EntityBrain
 
     spec = entity.EntitySpec()
     return PolicyDecider(EntityBrain(spec)), entity.init(spec, jax.random.key(args.seed))

@@ -212,13 +212,11 @@ def _load(name: str) -> Mission:
 
 
 def _planner(args: Args) -> Planner:
-    from sim2grid.loop.brains import make_planner
+    from moonteam.planners import registry
+    from moonteam.planners.kind import PlannerOptions
 
-    policy = None
-    if args.planner == "policy":
-        policy = paths.find(args.policy, "policies", ".safetensors")
-    return make_planner(args.planner, policy=policy, objective=args.objective,
-                        decode=args.decode)
+    return registry.make(args.planner, PlannerOptions(
+        args.objective, policy=args.policy, decode=args.decode))
 
 
 def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.trees import where
-from sim2grid.loop.brains import ask
 from sim2grid.loop.execution import Execution
 
 
@@ -106,8 +105,8 @@ class _Rows:
         """Has the planners answer all questions at once."""
         asking = [self._executions[k] for k in self.busy() if self._executions[k].question]
         questions = [e.question for e in asking if e.question is not None]
-        for execution, actions in zip(asking, ask([e.planner for e in asking], questions),
-                                      strict=True):
+        answers = [e.planner.act(q) for e, q in zip(asking, questions, strict=True)]
+        for execution, actions in zip(asking, answers, strict=True):
             execution.answer(actions)
 
     def _reset(self, fresh: npt.NDArray[np.bool_]) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.planners.base import IntArray, Planner, Snapshot
+from moonteam.planners.registry import check_planner
 from moonteam.planners.simulate import STAY, moved
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
@@ -30,7 +31,6 @@ from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.frame import Frame
 from sim2grid.loop import rules as law
 from sim2grid.loop.asked import Asked, Body, Mode, Route
-from sim2grid.loop.brains import check_planner
 from sim2grid.loop.events import Events
 from sim2grid.loop.known import Known
 from sim2grid.loop.logbook import Logbook, cell_of

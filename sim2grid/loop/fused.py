@@ -31,7 +31,7 @@ from moonteam.grid import env, scenarios
 from moonteam.grid.travel import UNREACHABLE, distances, first_step, problem_fields
 from moonteam.grid.types import Problem, State
 from moonteam.physics.backends import Log, MjxBackend, WorldState
-from moonteam.planners.learned import Brain
+from moonteam.policies.brain import Brain
 from moonteam.problem.scenario import Scenario
 from moonteam.robots.base import Command
 from sim2grid.frame import Frame

@@ -23,12 +23,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from moonteam import paths
+from moonteam.errors import InputError
+from moonteam.planners import registry
 from moonteam.planners.base import Objective, Planner
+from moonteam.planners.kind import PlannerOptions
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
 from sim2grid.loop.asked import Mode, Route
-from sim2grid.loop.brains import planner_maker
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
 from sim2grid.loop.record import Record
@@ -53,19 +54,44 @@ class Contender(msgspec.Struct, frozen=True):
 
     loop: Loop
     mode: Mode
-    planner: str  # policy, exact or greedy
+    planner: str  # a registered one, or FILE.py:OBJECT
     policy: str | None = None  # file or name of a bundled one
     decode: str = "argmax"
-    objective: Objective = "makespan"
+    objective: Objective | None = "makespan"  # None: makespan; best-of-K: what it prefers
     backend: str = "native"  # engine; without meaning for the loop `grid`
+    alpha: float = 1.0  # weights of the objective weighted
+    beta: float = 0.05
+    time_limit: float | None = None  # seconds a plan, of anytime planners
+    preference: float = 0.0  # of a policy
+
+    @classmethod
+    def of(cls, planner: str, options: PlannerOptions) -> Contender:
+        """A planner with what concerns it of its options. Raises InputError for none such."""
+        kind = registry.find(planner)
+        if not kind.wants_policy:
+            limit = options.time_limit if kind.anytime else None
+            return cls("closed", "barrier", planner, objective=options.goal[0],
+                       alpha=options.alpha, beta=options.beta, time_limit=limit)
+        objective = options.objective if options.preference else options.goal[0]
+        return cls("closed", "barrier", planner, str(options.policy), options.decode, objective,
+                   alpha=options.alpha, beta=options.beta, preference=options.preference)
+
+    @property
+    def options(self) -> PlannerOptions:
+        """What its planners are made from. Raises InputError."""
+        return PlannerOptions(self.objective, self.alpha, self.beta, self.time_limit,
+                              policy=self.policy or "any_team", decode=self.decode,
+                              preference=self.preference)
 
     @property
     def who(self) -> str:
-        """Planner, or policy with its decoding where that is not argmax."""
+        """Planner, or policy with its decoding where that is not argmax, and its preference."""
         if self.planner != "policy":
-            return self.planner
+            return registry.shown(self.planner)
+        words = [self.decode] if self.decode != "argmax" else []
+        words += [f"preference {self.preference:g}"] if self.preference else []
         name = Path(self.policy or "").stem
-        return name if self.decode == "argmax" else f"{name}({self.decode})"
+        return f"{name}({', '.join(words)})" if words else name
 
     @property
     def name(self) -> str:
@@ -268,11 +294,7 @@ def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) ->
 
 def maker(contender: Contender) -> Callable[[], Planner]:
     """Makes the planners of a contender. Raises InputError."""
-    policy = None
-    if contender.planner == "policy":
-        policy = paths.find(contender.policy or "", "policies", ".safetensors")
-    return planner_maker(contender.planner, policy=policy, objective=contender.objective,
-                         decode=contender.decode)
+    return registry.maker(contender.planner, contender.options)
 
 
 def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],
@@ -286,5 +308,6 @@ def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[
                 backends if loop != "grid" else ("native",)):
             for who in planners if loop != "oracle" else (exact,):
                 one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
-                found.setdefault(one.name, one)
+                if found.setdefault(one.name, one) != one:
+                    raise InputError("--planner", f"two would be called {who.who}; rename one")
     return list(found.values())

@@ -15,9 +15,11 @@ from moonteam.grid.config import EnvConfig
 from moonteam.grid.scenarios import generate, to_problem
 from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
+from moonteam.planners.best_of import prices
 from moonteam.planners.decode import parse
-from moonteam.planners.learned import LearnedPlanner, Policy
+from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies import policy_file, recurrent
+from moonteam.policies.policy import Policy
 from moonteam.policies.recurrent import RecurrentSpec
 from moonteam.problem import scenario as files
 
@@ -153,11 +155,11 @@ def test_the_watch_draws_where_argmax_circles(policy, small):
 
 
 def test_the_best_does_not_depend_on_the_pool(policy, small, monkeypatch):
-    prices = rollouts.price("moves")
+    cost = prices("moves")
 
     def best(decode="best-of-3", **how):
-        tries = rollouts.run(policy, small, parse(decode), 0.0, 5, "", prices, **how)
-        choice = rollouts.best(tries, prices)
+        tries = rollouts.run(policy, small, parse(decode), 0.0, 5, "", cost, **how)
+        choice = rollouts.best(tries, cost)
         return [rollouts.picked(v, choice).tolist() for v in (
             tries.success, tries.steps, tries.moves)]
 
@@ -185,9 +187,9 @@ def test_best_of_prefers_success_then_the_objective():
         steps=np.array([[9, 20, 21], [128, 128, 128]]),
         moves=np.array([[1, 40, 30], [7, 5, 6]]), rescues=np.zeros((2, 3), np.int64),
         seconds=0.0, compiling=0.0)
-    assert rollouts.best(tries, rollouts.price("makespan")).tolist() == [1, 1]
-    assert rollouts.best(tries, rollouts.price("moves")).tolist() == [2, 1]
-    assert rollouts.best(tries, rollouts.price("weighted", 1.0, 1.0)).tolist() == [2, 1]
+    assert rollouts.best(tries, prices("makespan")).tolist() == [1, 1]
+    assert rollouts.best(tries, prices("moves")).tolist() == [2, 1]
+    assert rollouts.best(tries, prices("weighted", 1.0, 1.0)).tolist() == [2, 1]
 
 
 @pytest.mark.parametrize("text", ["best-of-0", "best-of-", "best-of-x", "best-of--3", "beam",

@@ -7,8 +7,10 @@ import pytest
 from moonteam.errors import InputError
 from moonteam.planners import learned, simulate
 from moonteam.planners.base import Planner, Snapshot
-from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
+from moonteam.planners.best_of import plan_best_of
+from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies import recurrent
+from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import PolicyFile, load_policy, save_policy
 from moonteam.policies.recurrent import RecurrentSpec
 from moonteam.problem.scenario import Agent, Scenario, Target
@@ -175,8 +177,8 @@ def test_best_of_says_when_nothing_was_found(path):
 
 
 def test_a_whole_plan(path):
-    planner = LearnedPlanner.load(path, decode="sample")
-    plan = planner.plan(START, seed=3)
+    planner = LearnedPlanner.load(path, decode="sample", seed=3)
+    plan = planner.plan(START)
     assert plan.planner == "policy"
     if plan.status == "feasible":
         assert simulate.replay(START, plan.actions).makespan == plan.makespan

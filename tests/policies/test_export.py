@@ -15,10 +15,11 @@ from moonteam.commands.export import model_of
 from moonteam.grid import scenarios
 from moonteam.planners import learned
 from moonteam.planners.base import Snapshot
-from moonteam.planners.learned import LearnedPlanner, Policy
+from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies import entity, recurrent
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.export import onboard
+from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import PolicyFile, save_policy
 from moonteam.policies.recurrent import RecurrentSpec
 

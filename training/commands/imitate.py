@@ -11,8 +11,9 @@ import tyro
 from moonteam import paths
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
-from moonteam.planners.learned import EntityBrain, Policy
+from moonteam.policies.brain import EntityBrain
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.policy import Policy
 from moonteam.report.progress import say
 from training.commands.ending import Taught, complete
 from training.run.machine import Run

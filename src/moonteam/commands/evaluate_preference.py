@@ -44,7 +44,8 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import figures, preference
     from moonteam.planners import decode
-    from moonteam.planners.learned import EntityBrain, Policy
+    from moonteam.policies.brain import EntityBrain
+    from moonteam.policies.policy import Policy
     from moonteam.report import command, tables
 
     how = decode.parse(args.decode)

@@ -63,7 +63,7 @@ def _measured(args: Args, cores: str) -> dict:
     """The report."""
     compilation.enable_cache()
     from moonteam.evaluation.speed import timing
-    from moonteam.planners.learned import Policy
+    from moonteam.policies.policy import Policy
     from moonteam.report import command
 
     sizes = timing.Sizes(args.targets or (3, 4, 5, 6, 7, 8, 9, 10, 12), args.count, args.agents,

@@ -14,7 +14,7 @@ from moonteam.errors import InputError
 from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
-    from moonteam.planners.learned import Policy
+    from moonteam.policies.policy import Policy
 
 TOLERANCE = 1e-3
 
@@ -50,7 +50,7 @@ def model_of(policy: Policy) -> bytes:
     except ImportError as error:
         raise InputError("moonteam export", f"{error.name} is missing; install the extra: "
                          "pip install 'moonteam[export]'") from None
-    from moonteam.planners.learned import EntityBrain, RecurrentBrain
+    from moonteam.policies.brain import EntityBrain, RecurrentBrain
 
     if isinstance(policy.brain, EntityBrain):
         return onnx_graph.entity_graph(policy.source, policy.brain.spec).SerializeToString()
@@ -68,7 +68,7 @@ def run(args: Args) -> int:
         raise InputError("--out", f"{out} does not end in .onnx")
     compilation.enable_cache()
     from moonteam.evaluation import exported
-    from moonteam.planners.learned import Policy
+    from moonteam.policies.policy import Policy
 
     policy = Policy.load(path)
     model = model_of(policy)

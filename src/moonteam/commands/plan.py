@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,7 @@ from moonteam import files, paths
 from moonteam.commands.options import Printed, Saved
 from moonteam.errors import InputError
 from moonteam.planners.base import Objective, Plan, Snapshot
+from moonteam.planners.kind import PlannerOptions
 from moonteam.problem import scenario
 from moonteam.problem.scenario import Scenario
 from moonteam.report.progress import busy
@@ -119,57 +119,19 @@ def _mission_case(path: Path) -> Case:
 
 def make_plan(args: Args, snapshot: Snapshot) -> Plan:
     """The plan that the chosen planner makes. Raises InputError."""
-    common = (args.objective, args.alpha, args.beta)
-    if args.planner == "exact":
-        from moonteam.planners.exact import ExactPlanner
+    from moonteam.planners import registry
 
-        return ExactPlanner(*common, time_limit=args.time_limit).plan(snapshot)
-    if args.planner == "greedy":
-        from moonteam.planners.greedy import GreedyPlanner
+    if registry.find(args.planner).wants_policy:
+        from moonteam import compilation
 
-        return GreedyPlanner(*common).plan(snapshot)
-    if args.planner == "lns":
-        from moonteam.planners.lns import LnsPlanner
-
-        return LnsPlanner(*common, time_limit=args.time_limit, seed=args.seed).plan(snapshot)
-    if args.planner == "cpsat":
-        from moonteam.planners.cpsat import CpSatPlanner
-
-        return CpSatPlanner(*common, time_limit=args.time_limit).plan(snapshot)
-    if args.planner == "exhaustive":
-        from moonteam.planners.exhaustive import ExhaustivePlanner
-
-        return ExhaustivePlanner(*common).plan(snapshot)
-    return _policy_plan(args, snapshot)
+        compilation.enable_cache()
+    return registry.make(args.planner, options_of(args)).plan(snapshot)
 
 
-def _policy_plan(args: Args, snapshot: Snapshot) -> Plan:
-    from moonteam import compilation
-    from moonteam.planners import decode as decoding
-    from moonteam.planners.learned import LearnedPlanner, Policy, plan_best_of
-    from moonteam.planners.plans.stepwise import plan_from_planner
-
-    how = decoding.parse(args.decode)
-    compilation.enable_cache()
-    policy = Policy.load(paths.find(args.policy, "policies", ".safetensors"))
-    if how.rollouts > 1:
-        return plan_best_of(policy, snapshot, how.rollouts, args.seed, args.objective,
-                            how.temperature, args.preference)
-    planner = LearnedPlanner(policy, "sample" if how.sample else "argmax", how.temperature,
-                             how.watch, args.preference)
-    return plan_from_planner(planner, snapshot, args.objective, args.seed)
-
-
-def check(args: Args) -> None:
-    """Raises InputError for options that make no sense."""
-    limit = args.time_limit
-    if limit is not None and not (math.isfinite(limit) and limit > 0):
-        raise InputError("--time-limit", f"{limit} is not allowed; seconds above 0")
-    if args.seed < 0:
-        raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
-    if not 0.0 <= args.preference <= 1.0:
-        raise InputError("--preference",
-                         f"{args.preference} is not allowed; 0 (time) to 1 (effort)")
+def options_of(args: Args) -> PlannerOptions:
+    """What the planner is made from. Raises InputError."""
+    return PlannerOptions(args.objective, args.alpha, args.beta, args.time_limit, args.seed,
+                          args.policy, args.decode, args.preference)
 
 
 def print_plan(case: Case, plan: Plan, alpha: float, beta: float) -> None:
@@ -217,7 +179,7 @@ def _verdict(plan: Plan, alpha: float, beta: float) -> str:
 
 def run(args: Args) -> int:
     """Plans, prints, and draws; 1 if there is no plan."""
-    check(args)
+    options_of(args)
     case = load_case(args.scenario)
     with busy("planning; the first time on a machine it compiles for a minute"):
         plan = make_plan(args, Snapshot.start(case.scenario))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -14,21 +15,18 @@ from moonteam.errors import InputError
 from moonteam.evaluation import rollouts
 from moonteam.evaluation.metrics import Outcomes
 from moonteam.evaluation.world import Walk, World, joint_actions, replay, snapshots
+from moonteam.planners import best_of, registry, simulate
 from moonteam.planners import decode as decoding
-from moonteam.planners import exact, exhaustive, simulate
-from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
-from moonteam.planners.cpsat import CpSatPlanner
+from moonteam.planners.base import IntArray, Objective, Snapshot, WholePlanner, check_objective
 from moonteam.planners.decode import Decode
-from moonteam.planners.exact import ExactPlanner
-from moonteam.planners.exhaustive import ExhaustivePlanner
-from moonteam.planners.greedy import GreedyPlanner
-from moonteam.planners.learned import EntityBrain, Policy
-from moonteam.planners.lns import LnsPlanner
+from moonteam.planners.kind import PlannerKind, PlannerOptions
+from moonteam.policies.brain import EntityBrain
+from moonteam.policies.policy import Policy
 from moonteam.report.progress import track
 
-OBJECTIVES: dict[str, Objective] = {"makespan": "makespan", "moves": "moves",
-                                    "weighted": "weighted"}
-"""The objectives by the names a user gives."""
+POLICY = "policy"
+"""The planner whose rows are played in batches, one for each decoding."""
+MAKESPAN: tuple[Objective, ...] = ("makespan",)
 
 
 @dataclass(frozen=True)
@@ -48,21 +46,11 @@ class Options:
     seed: int = 0
     alone: bool = False
 
-
-class WholePlanner(Protocol):
-    """A planner that can plan a mission to its end, and act where it cannot."""
-
-    def plan(self, snapshot: Snapshot) -> Plan:
-        """A whole plan."""
-        ...
-
-    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
-        """Starts a mission."""
-        ...
-
-    def act(self, snapshot: Snapshot) -> IntArray:
-        """Joint action [N]."""
-        ...
+    def of(self, objective: Objective | None = None, limit: float | None = None,
+           preference: float = 0.0, policy: str | Path | None = None) -> PlannerOptions:
+        """What one planner of them is made from. Raises InputError."""
+        return PlannerOptions(objective, self.alpha, self.beta, limit, self.seed,
+                              policy or "any_team", preference=preference)
 
 
 class Contender(Protocol):
@@ -82,40 +70,6 @@ class Contender(Protocol):
         ...
 
 
-Seconds = float | None
-
-
-def _exact(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
-    return ExactPlanner(objective, options.alpha, options.beta, limit)
-
-
-def _greedy(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
-    del limit
-    return GreedyPlanner(objective, options.alpha, options.beta)
-
-
-def _lns(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
-    return LnsPlanner(objective, options.alpha, options.beta, time_limit=limit,
-                      seed=options.seed)
-
-
-def _cpsat(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
-    return CpSatPlanner(objective, options.alpha, options.beta, limit)
-
-
-def _exhaustive(options: Options, objective: Objective, limit: Seconds) -> WholePlanner:
-    del limit
-    return ExhaustivePlanner(objective, options.alpha, options.beta)
-
-
-PLANNERS: dict[str, Callable[[Options, Objective, Seconds], WholePlanner]] = {
-    "exact": _exact, "greedy": _greedy, "lns": _lns, "cpsat": _cpsat, "exhaustive": _exhaustive}
-ANYTIME = ("exact", "lns", "cpsat")
-"""Those that a time limit stops with the best plan found so far."""
-LIMITS = {"exact": exact.MAX_TARGETS, "exhaustive": exhaustive.MAX_TARGETS}
-"""Targets of a scenario that some planners refuse to go beyond."""
-
-
 @dataclass(frozen=True)
 class Planned:
     """A planner on the host. When a target appears, it plans again."""
@@ -123,7 +77,7 @@ class Planned:
     planner: WholePlanner
     kind: str
     objective: Objective
-    limit: Seconds = None  # where there are rows with several
+    limit: float | None = None  # where there are rows with several
 
     @property
     def name(self) -> str:
@@ -134,7 +88,8 @@ class Planned:
     def check(self, world: World) -> None:
         """Raises InputError, the planner's own, if a scenario has too many targets for it."""
         most = max(world.scenarios, key=lambda s: len(s.targets))
-        if len(most.targets) - world.num_buffer > LIMITS.get(self.kind, len(most.targets)):
+        allowed = getattr(self.planner, "most_targets", None)
+        if allowed is not None and len(most.targets) - world.num_buffer > allowed:
             self.planner.plan(Snapshot.start(most))
 
     def run(self, world: World) -> Outcomes:
@@ -204,8 +159,7 @@ class Learned:
     def run(self, world: World) -> Outcomes:
         """See `Contender`."""
         options = self.options
-        prices = (rollouts.price(self.objective, options.alpha, options.beta) if self.objective
-                  else rollouts.wish(self.preference))
+        prices = best_of.prices(self.objective, options.alpha, options.beta, self.preference)
         tries = rollouts.run(self.policy, world, self.decode, self.preference, options.seed,
                              self.name, prices, options.alone)
         choice = rollouts.best(tries, prices)
@@ -232,28 +186,38 @@ def outcomes(name: str, world: World, walk: Walk, seconds: float, first_call: fl
 def contenders(options: Options) -> list[Contender]:
     """All rows asked for. Raises InputError at the first wrong name or number."""
     if not options.planners:
-        raise InputError("--planner", f"at least one is needed: {_known()}")
-    for objective in options.objectives:
-        if objective not in OBJECTIVES:
-            raise InputError("--objective", f"{objective!r} is not one of {', '.join(OBJECTIVES)}")
+        raise InputError("--planner", "at least one is needed: " + ", ".join(registry.names()))
+    given: list[Objective] = [check_objective(one, options.alpha, options.beta)
+             for one in dict.fromkeys(options.objectives)]
     for limit in options.time_limits:
-        if not limit > 0.0:
-            raise InputError("--time-limit", f"{limit} is not allowed; above 0")
-    given: list[Objective] = [OBJECTIVES[o] for o in dict.fromkeys(options.objectives)]
-    objectives: list[Objective] = given or ["makespan"]
+        options.of(limit=limit)
+    for preference in options.preferences:
+        options.of(preference=preference)
     found: list[Contender] = []
     for planner in dict.fromkeys(options.planners):
-        if planner == "policy":
-            found += _policies(options, given)
-        elif planner in PLANNERS:
-            limits = [*dict.fromkeys(options.time_limits)] if planner in ANYTIME else []
-            found += [Planned(PLANNERS[planner](options, o, limit), planner, o,
-                              limit if len(limits) > 1 else None)
-                      for o in objectives for limit in limits or [None]]
-        else:
-            raise InputError("--planner", f"{planner!r} is not one of {_known()}")
-    if options.policies and "policy" not in options.planners:
-        raise InputError("--policy", "has no effect without --planner policy")
+        kind = registry.find(planner)
+        found += _policies(options, given) if kind.name == POLICY else _planned(
+            planner, kind, options, given or MAKESPAN)
+    if options.policies and not any(registry.find(p).wants_policy for p in options.planners):
+        raise InputError("--policy", f"has no effect without --planner {POLICY}")
+    names = [one.name for one in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError("--planner", f"two rows would be called {name}; rename one")
+    return found
+
+
+def _planned(planner: str, kind: PlannerKind, options: Options,
+             objectives: Sequence[Objective]) -> list[Contender]:
+    """The rows of one planner: every objective, policy file and, if it is anytime, limit."""
+    limits = [*dict.fromkeys(options.time_limits)] if kind.anytime else []
+    files = options.policies if kind.wants_policy else ()
+    found: list[Contender] = []
+    for objective, file, limit in itertools.product(objectives, files or [None],
+                                                    limits or [None]):
+        name = kind.name + (f" {called(file)}" if file is not None and len(files) > 1 else "")
+        made = registry.make(planner, options.of(objective, limit, policy=file))
+        found.append(Planned(made, name, objective, limit if len(limits) > 1 else None))
     return found
 
 
@@ -262,17 +226,10 @@ def called(path: Path) -> str:
     return path.absolute().parent.name if path.stem == "policy" else path.stem
 
 
-def _known() -> str:
-    return ", ".join([*PLANNERS, "policy"])
-
-
 def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contender]:
     """The rows of every policy file, preference and decoding."""
     if not options.policies:
         raise InputError("--policy", "a policy file is needed with --planner policy")
-    for preference in options.preferences:
-        if not 0.0 <= preference <= 1.0:
-            raise InputError("--preference", f"{preference} is not allowed; 0 (time) to 1 (effort)")
     decodes = [decoding.parse(text) for text in dict.fromkeys(options.decodes)]
     policies = [Policy.load(path) for path in options.policies]
     found: list[Contender] = []

@@ -17,9 +17,10 @@ from moonteam.evaluation.rollouts import Player, Pool
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
 from moonteam.grid.scenarios import generate
-from moonteam.planners.learned import EntityBrain, Policy, RecurrentBrain
 from moonteam.policies import entity
+from moonteam.policies.brain import EntityBrain, RecurrentBrain
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.policy import Policy
 from moonteam.problem.scenario import Scenario
 from moonteam.report.progress import track
 

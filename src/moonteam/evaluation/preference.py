@@ -16,9 +16,10 @@ from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Planned
 from moonteam.evaluation.metrics import Outcomes, Reference
 from moonteam.evaluation.world import World
+from moonteam.planners import best_of
 from moonteam.planners.decode import Decode
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
-from moonteam.planners.learned import Policy
+from moonteam.policies.policy import Policy
 from moonteam.problem.scenario import Scenario
 from moonteam.report import provenance
 from moonteam.report.intervals import Bootstrap
@@ -58,7 +59,7 @@ def evaluate(scenarios: Sequence[Scenario], policy: Policy, decode: Decode,
 
 def _policy(world: World, policy: Policy, decode: Decode, preference: float,
             seed: int) -> Outcomes:
-    prices = rollouts.wish(preference)
+    prices = best_of.prices(preference=preference)
     tries = rollouts.run(policy, world, decode, preference, seed, f"preference {preference:g}",
                          prices)
     choice = rollouts.best(tries, prices)

@@ -26,16 +26,19 @@ from moonteam import trees
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.world import Walk, World
 from moonteam.grid.config import EnvConfig
-from moonteam.planners.base import Objective
+from moonteam.planners import best_of
+from moonteam.planners.best_of import cheapest
 from moonteam.planners.decode import Decode
-from moonteam.planners.learned import Brain, Policy, masked
+from moonteam.planners.learned import masked
 from moonteam.planners.search.travel import distance_fields
+from moonteam.policies.brain import Brain
+from moonteam.policies.policy import Policy
 from moonteam.report.progress import say, track
 
 MOST_EPISODES = 256
 _PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of a network holds
+FASTEST = best_of.prices("makespan")
 _STEPS = 8  # between two looks at which episodes have ended
-_TIE = 2.0**-20
 
 IntArray = npt.NDArray[np.int64]
 
@@ -264,18 +267,8 @@ class _Ledger:
                      self.moves.reshape(shape), self.rescues.reshape(shape), seconds, compiling)
 
 
-def price(objective: Objective, alpha: float = 1.0, beta: float = 0.05) -> tuple[float, float]:
-    """What a step and a move cost; ties of one fall to the other."""
-    return {"makespan": (1.0, _TIE), "moves": (_TIE, 1.0), "weighted": (alpha, beta)}[objective]
-
-
-def wish(preference: float) -> tuple[float, float]:
-    """What a step and a move cost to a preference of 0 (time) to 1 (effort)."""
-    return 1.0 - preference + _TIE, preference + _TIE
-
-
 def run(policy: Policy, world: World, decode: Decode, preference: float, seed: int, title: str,
-        prices: tuple[float, float] = (1.0, _TIE), alone: bool = False) -> Tries:
+        prices: tuple[float, float] = FASTEST, alone: bool = False) -> Tries:
     """Plays every scenario `decode.rollouts` times.
 
     Args:
@@ -346,9 +339,8 @@ def _places(world: World, episodes: int) -> int:
 
 
 def best(tries: Tries, prices: tuple[float, float]) -> IntArray:
-    """[S] the try that counts: a solved one if there is one, then the cheapest."""
-    cost = prices[0] * tries.steps + prices[1] * tries.moves
-    return np.argmin(np.where(tries.success, cost, cost + cost.max() + 1.0), axis=1)
+    """[S] the try that counts, see `planners.best_of`."""
+    return cheapest(tries.success, tries.steps, tries.moves, prices)
 
 
 def picked(values: npt.NDArray, choice: IntArray) -> npt.NDArray:

@@ -5,6 +5,7 @@ Legend: N agents, M targets, K kinds. NumPy on the host; cells are (x, y).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -12,6 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from moonteam.errors import InputError
 from moonteam.problem.scenario import ACTIONS, Scenario
 
 IntArray = npt.NDArray[np.int32]
@@ -19,6 +21,19 @@ BoolArray = npt.NDArray[np.bool_]
 Objective = Literal["makespan", "moves", "weighted"]
 SAMPLING = 0.5
 """Temperature at which policies draw actions, the best of those tried for best-of-K."""
+OBJECTIVES: tuple[Objective, ...] = ("makespan", "moves", "weighted")
+
+
+def check_objective(objective: str, alpha: float, beta: float) -> Objective:
+    """The objective, if it is one and its weights make sense. Raises InputError."""
+    known: dict[str, Objective] = {name: name for name in OBJECTIVES}
+    if objective not in known:
+        raise InputError("--objective", f"{objective!r} is not one of {', '.join(OBJECTIVES)}")
+    if objective == "weighted" and not (
+            alpha >= 0 and beta >= 0 and 0 < alpha + beta < math.inf):
+        raise InputError("--objective weighted", f"alpha {alpha} and beta {beta} are not allowed; "
+                         "both at least 0, one above 0")
+    return known[objective]
 
 
 @dataclass(frozen=True)
@@ -140,4 +155,13 @@ class Planner(Protocol):
 
     def act(self, snapshot: Snapshot) -> IntArray:
         """Joint action [N] 0..4 for the current moment; called once a decision."""
+        ...
+
+
+@runtime_checkable
+class WholePlanner(Planner, Protocol):
+    """A planner that also plans a mission to its end; what the registry makes is one."""
+
+    def plan(self, snapshot: Snapshot) -> Plan:
+        """A whole plan from this moment. Raises InputError if it cannot serve it."""
         ...

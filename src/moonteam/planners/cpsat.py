@@ -19,6 +19,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
+from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.lns import Weights, best_insertion, improve
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search.insertion import coalitions
@@ -156,3 +157,10 @@ class CpSatPlanner(RoutePlanner):
             used |= {(a, t, t) for t in range(len(task.targets)) if t not in places}
         for key, (_, literal) in arcs.items():
             model.add_hint(literal, key in used)
+
+
+def _planner(options: PlannerOptions) -> CpSatPlanner:
+    return CpSatPlanner(*options.goal, time_limit=options.time_limit)
+
+
+PLANNER = PlannerKind("cpsat", _planner, anytime=True)

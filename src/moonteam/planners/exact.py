@@ -21,6 +21,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
+from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.lns import Weights, best_insertion, measure
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search import schedules
@@ -46,6 +47,7 @@ class ExactPlanner(RoutePlanner):
     """
 
     name = "exact"
+    most_targets = MAX_TARGETS
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
                  time_limit: float | None = None):
@@ -98,3 +100,10 @@ class ExactPlanner(RoutePlanner):
         if self.objective == "moves":
             return math.ceil(bound - 1e-6)
         return bound
+
+
+def _planner(options: PlannerOptions) -> ExactPlanner:
+    return ExactPlanner(*options.goal, time_limit=options.time_limit)
+
+
+PLANNER = PlannerKind("exact", _planner, anytime=True, most_targets=MAX_TARGETS)

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from moonteam.errors import InputError
+from moonteam.planners.kind import PlannerKind
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search.task import Task, weights
 from moonteam.planners.search.travel import UNREACHABLE
@@ -85,6 +86,7 @@ class ExhaustivePlanner(RoutePlanner):
     """
 
     name = "exhaustive"
+    most_targets = MAX_TARGETS
 
     def _answer(self, task: Task, began: float) -> Answer:
         count = len(task.targets)
@@ -101,3 +103,7 @@ class ExhaustivePlanner(RoutePlanner):
             padded[a, :len(route)] = route
         bound = math.floor(value + 1e-9) if self.objective != "weighted" else value
         return Answer(padded, bound, True)
+
+
+PLANNER = PlannerKind("exhaustive", lambda options: ExhaustivePlanner(*options.goal),
+                      most_targets=MAX_TARGETS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from moonteam.planners.kind import PlannerKind
 from moonteam.planners.lns import InsertionPlanner
 
 
@@ -13,3 +14,6 @@ class GreedyPlanner(InsertionPlanner):
     """
 
     name = "greedy"
+
+
+PLANNER = PlannerKind("greedy", lambda options: GreedyPlanner(*options.goal))

@@ -14,6 +14,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective, Snapshot
+from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search import insertion
 from moonteam.planners.search.bounds import lower_bounds
@@ -188,3 +189,10 @@ class LnsPlanner(InsertionPlanner):
     def _improved(self, task: Task, goal: Weights, events: Events, began: float) -> Events:
         until = None if self.time_limit is None else began + self.time_limit
         return improve(task, goal, events, self.seed, self.iterations, until)
+
+
+def _planner(options: PlannerOptions) -> LnsPlanner:
+    return LnsPlanner(*options.goal, time_limit=options.time_limit, seed=options.seed)
+
+
+PLANNER = PlannerKind("lns", _planner, anytime=True)

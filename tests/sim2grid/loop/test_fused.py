@@ -8,8 +8,9 @@ import pytest
 
 from moonteam.physics.backends import MjxBackend
 from moonteam.planners.base import Snapshot
-from moonteam.planners.learned import EntityBrain, state_of
+from moonteam.planners.learned import state_of
 from moonteam.policies import entity
+from moonteam.policies.brain import EntityBrain
 from sim2grid.loop import fused, fused_record
 from sim2grid.loop.drive import run
 from sim2grid.loop.execution import Execution

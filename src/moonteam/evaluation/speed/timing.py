@@ -17,25 +17,21 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.grid.scenarios import generate
-from moonteam.planners import exact, exhaustive
-from moonteam.planners.base import Objective, Snapshot
-from moonteam.planners.exact import ExactPlanner
-from moonteam.planners.exhaustive import ExhaustivePlanner
-from moonteam.planners.greedy import GreedyPlanner
-from moonteam.planners.learned import (
-    EntityBrain,
-    LearnedPlanner,
-    Policy,
-    RecurrentBrain,
-    plan_best_of,
-)
+from moonteam.planners import registry
+from moonteam.planners.base import OBJECTIVES, Objective, Snapshot, check_objective
+from moonteam.planners.best_of import plan_best_of
+from moonteam.planners.kind import PlannerOptions
+from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies import policy_file, recurrent
+from moonteam.policies.brain import EntityBrain, RecurrentBrain
+from moonteam.policies.policy import Policy
 from moonteam.policies.recurrent import RecurrentSpec
 from moonteam.report import clock, provenance
 from moonteam.report.progress import track
 from moonteam.report.tables import duration
 
-OBJECTIVES: tuple[Objective, ...] = ("makespan", "moves", "weighted")
+POLICY = "policy"
+USUAL = ("exact", "greedy", "exhaustive", POLICY)
 EXACT = "exact(makespan)"
 DECISION, PLAN, BEST = "policy, one decision", "policy, whole plan", "policy, best of"
 
@@ -52,6 +48,9 @@ class Sizes:
     budget: float = 10.0  # seconds a planner and size may take
     best_of: int = 16
     seed: int = 0
+    planners: Sequence[str] = USUAL
+    objectives: Sequence[Objective] = ()  # empty: all of the exact planner, else makespan
+    time_limit: float | None = None  # seconds a plan, of anytime planners
 
     def check(self) -> None:
         """Raises InputError if a number makes no sense."""
@@ -60,6 +59,11 @@ class Sizes:
         for name in ("count", "best_of"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name.replace('_', '-')}", "at least 1")
+        for objective in self.objectives:
+            check_objective(objective, 1.0, 0.05)
+        PlannerOptions(time_limit=self.time_limit)
+        for name in self.planners:
+            registry.find(name)
         if self.budget <= 0:
             raise InputError("--budget", f"{self.budget} is not allowed; above 0")
 
@@ -91,35 +95,46 @@ def policy_for(given: Policy | None, sizes: Sizes, targets: int) -> Policy:
     return untrained(wanted)
 
 
-def methods(policy: Policy, sizes: Sizes, targets: int) -> dict[str, Callable[[Snapshot], Any]]:
-    """What is timed at one size, by the names of the report."""
+def methods(policy: Policy | None, sizes: Sizes, targets: int
+            ) -> dict[str, Callable[[Snapshot], Any]]:
+    """What is timed at one size, by the names of the report; `policy` None if none is wanted."""
     found: dict[str, Callable[[Snapshot], Any]] = {}
-    if targets <= exact.MAX_TARGETS:
-        found |= {f"exact({o})": ExactPlanner(o).plan for o in OBJECTIVES}
-    found["greedy(makespan)"] = GreedyPlanner("makespan").plan
-    if targets <= exhaustive.MAX_TARGETS:
-        found["exhaustive(makespan)"] = ExhaustivePlanner("makespan").plan
+    for name in dict.fromkeys(sizes.planners):
+        kind = registry.find(name)
+        if kind.most_targets is not None and targets > kind.most_targets:
+            continue
+        if kind.name == POLICY and policy is not None:
+            found |= _policy_methods(policy, sizes.best_of)
+            continue
+        usual = OBJECTIVES if kind.name == "exact" else ("makespan",)
+        for objective in sizes.objectives or usual:
+            found[f"{kind.name}({objective})"] = registry.make(name, PlannerOptions(
+                objective, time_limit=sizes.time_limit, seed=sizes.seed,
+                policy=policy or "any_team")).plan
+    return found
+
+
+def _policy_methods(policy: Policy, best_of: int) -> dict[str, Callable[[Snapshot], Any]]:
     planner = LearnedPlanner(policy)
 
     def decide(moment: Snapshot) -> Any:
         planner.reset(moment)
         return planner.act(moment)
 
-    found[DECISION] = decide
-    found[PLAN] = lambda moment: plan_best_of(policy, moment, 1)
-    found[f"{BEST} {sizes.best_of} plans"] = (
-        lambda moment: plan_best_of(policy, moment, sizes.best_of))
-    return found
+    return {DECISION: decide, PLAN: lambda moment: plan_best_of(policy, moment, 1),
+            f"{BEST} {best_of} plans": lambda moment: plan_best_of(policy, moment, best_of)}
 
 
 def evaluate(given: Policy | None, sizes: Sizes, command: str, cores: str = "") -> dict:
     """The measurements as a JSON-able document; `cores` says in words what ran on how many."""
     sizes.check()
-    rows = []
+    rows, learned = [], POLICY in sizes.planners
+    wanted = any(registry.find(name).wants_policy for name in sizes.planners)
     for targets in track(list(sizes.targets), "timing", len(sizes.targets)):
         moments = sizes.scenarios(targets)
-        policy = policy_for(given, sizes, targets)
-        policy.check(moments[0])
+        policy = policy_for(given, sizes, targets) if wanted else None
+        if policy is not None:
+            policy.check(moments[0])
         for name, call in methods(policy, sizes, targets).items():
             times = clock.measure(call, moments, sizes.budget)
             rows.append({"planner": name, "targets": targets, **times.document()})
@@ -127,9 +142,10 @@ def evaluate(given: Policy | None, sizes: Sizes, command: str, cores: str = "") 
     notes = [*findings(rows),
              f"{sizes.num_agents} agents on {sizes.side} x {sizes.side}, up to {sizes.count} "
              f"random scenarios a size; medians of single calls, first calls apart"
-             f"{'; ' + cores if cores else ''}. A search's decision is its plan. The policy's "
-             "plan is one jitted call that ends when no rollout can become better, or with "
-             f"{sizes.max_steps} decisions; its network: {kind}."]
+             f"{'; ' + cores if cores else ''}. A search's decision is its plan."
+             + (" The policy's plan is one jitted call that ends when no rollout can become "
+                f"better, or with {sizes.max_steps} decisions; its network: {kind}."
+                if learned else "")]
     return {"title": "planning time against the number of targets", "rows": rows,
             "notes": notes, "meta": provenance.meta(command, sizes.seed)}
 

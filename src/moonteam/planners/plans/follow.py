@@ -36,8 +36,42 @@ class Answer:
     proved: bool
 
 
-class RoutePlanner(ABC):
-    """A Planner made of a search for routes: asked once, followed while all goes as foreseen.
+class Follower(ABC):
+    """A Planner that looks ahead once and follows what it saw while all goes as foreseen."""
+
+    def __init__(self) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
+        self.replans = 0
+        self._actions: list[IntArray] = []
+        self._expected: Snapshot | None = None
+
+    @abstractmethod
+    def _ahead(self, snapshot: Snapshot) -> IntArray:
+        """The joint actions [T, N] to follow from this moment; none if there is no plan."""
+
+    def _beyond(self, snapshot: Snapshot) -> IntArray:
+        """Joint action [N] where those are at their end."""
+        return np.full(len(snapshot.cells), simulate.STAY, np.int32)
+
+    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
+        """Starts a mission; planners without chance ignore the seed."""
+        self._forget()
+
+    def act(self, snapshot: Snapshot) -> IntArray:
+        """Joint action [N]: the plan's next, or the first of a new plan."""
+        if self._expected is None or not same_moment(snapshot, self._expected):
+            self.replans += 1
+            self._actions = list(self._ahead(snapshot))
+        joint = self._actions.pop(0) if self._actions else self._beyond(snapshot)
+        held = replace(snapshot, solved=simulate.holding(snapshot))
+        self._expected = simulate.step(held, joint)
+        return joint
+
+
+class RoutePlanner(Follower):
+    """A Planner made of a search for routes.
 
     When the team cannot solve every target, or not in the steps left, `act` still works on
     those it can solve.
@@ -49,14 +83,14 @@ class RoutePlanner(ABC):
     """
 
     name: str
+    most_targets: int | None = None
+    """Open targets that it takes on; None: any number."""
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05):
         weights(objective, alpha, beta, 1, 1)
         self.objective: Objective = objective
         self.alpha, self.beta = alpha, beta
-        self.replans = 0
-        self._actions: list[IntArray] = []
-        self._expected: Snapshot | None = None
+        super().__init__()
 
     @abstractmethod
     def _answer(self, task: Task, began: float) -> Answer:
@@ -84,24 +118,8 @@ class RoutePlanner(ABC):
                             "optimal" if answer.proved else "feasible", answer.bound)
         return plan_of_routes(snapshot, travel, task.named(answer.routes), claim, seconds)
 
-    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
-        """Starts a mission; planners without chance ignore the seed."""
-        self._actions = []
-        self._expected = None
-        self.replans = 0
-
-    def act(self, snapshot: Snapshot) -> IntArray:
-        """Joint action [N]: the plan's next, or the first of a new plan."""
-        if self._expected is None or not same_moment(snapshot, self._expected):
-            self.replans += 1
-            self._actions = list(self._best_effort(snapshot).actions)
-        if self._actions:
-            joint = self._actions.pop(0)
-        else:
-            joint = np.full(len(snapshot.cells), simulate.STAY, np.int32)
-        held = replace(snapshot, solved=simulate.holding(snapshot))
-        self._expected = simulate.step(held, joint)
-        return joint
+    def _ahead(self, snapshot: Snapshot) -> IntArray:
+        return self._best_effort(snapshot).actions
 
     def _best_effort(self, snapshot: Snapshot) -> Plan:
         plan = self.plan(snapshot)

@@ -1,4 +1,4 @@
-"""A plan made by letting any Planner decide step by step on the grid's rules."""
+"""Whole plans of planners that only decide, made by letting them decide on the grid's rules."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from moonteam.planners.base import Objective, Plan, Planner, Snapshot
+from moonteam.errors import InputError
+from moonteam.planners.base import IntArray, Objective, Plan, Planner, Snapshot
 from moonteam.planners.plans.routes import Certificate, infeasible, obstacles, plan_of_trace
 from moonteam.planners.search.travel import travel_times
-from moonteam.planners.simulate import Trace, holding, step
+from moonteam.planners.simulate import STAY, Trace, holding, step
 
 
 def plan_from_planner(planner: Planner, snapshot: Snapshot, objective: Objective = "makespan",
@@ -52,3 +53,44 @@ def plan_from_planner(planner: Planner, snapshot: Snapshot, objective: Objective
     left = ", ".join(str(t) for t in np.flatnonzero(~now.solved).tolist())
     return replace(plan, status="infeasible", reason=f"{planner.name} left targets {left} "
                    f"unsolved after {now.step - snapshot.step} steps")
+
+
+class Stepwise:
+    """A planner with `reset` and `act` alone, completed by the whole plan they amount to.
+
+    Args:
+      planner: somebody's own; what it answers is checked.
+      name: where it has none.
+      objective: written into its plans.
+      seed: of its plans.
+    """
+
+    def __init__(self, planner: Planner, name: str, objective: Objective = "makespan",
+                 seed: int = 0):
+        self.planner, self.seed = planner, seed
+        self.objective: Objective = objective
+        self.name = str(getattr(planner, "name", name))
+        self.most_targets: int | None = getattr(planner, "most_targets", None)
+
+    def check(self, snapshot: Snapshot) -> None:
+        """What the planner itself says of a mission, if it has a `check`."""
+        own = getattr(self.planner, "check", None)
+        if own is not None:
+            own(snapshot)
+
+    def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
+        """Starts a mission."""
+        self.planner.reset(snapshot, seed)
+
+    def act(self, snapshot: Snapshot) -> IntArray:
+        """Joint action [N]. Raises InputError if the planner answers with anything else."""
+        joint = np.asarray(self.planner.act(snapshot))
+        whole = joint.dtype.kind in "iu" and joint.shape == (len(snapshot.cells),)
+        if not whole or (joint < 0).any() or (joint > STAY).any():
+            raise InputError(f"--planner {self.name}", f"act returned {joint.tolist()}; "
+                             f"{len(snapshot.cells)} whole numbers of 0 to {STAY} are needed")
+        return joint.astype(np.int32)
+
+    def plan(self, snapshot: Snapshot) -> Plan:
+        """The whole plan that its decisions make; infeasible if they fail."""
+        return plan_from_planner(self, snapshot, self.objective, self.seed)

@@ -5,13 +5,11 @@ Legend: N agents, M open targets, K kinds.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from moonteam.errors import InputError
-from moonteam.planners.base import BoolArray, IntArray, Objective, Snapshot
+from moonteam.planners.base import BoolArray, IntArray, Objective, Snapshot, check_objective
 from moonteam.planners.search.travel import Travel
 from moonteam.planners.simulate import holding
 
@@ -63,16 +61,10 @@ def weights(objective: Objective, alpha: float, beta: float, agents: int,
     Among plans of least makespan the one of fewest moves is wanted: moves get a weight so
     small that all of them together weigh less than one step. Raises InputError.
     """
+    check_objective(objective, alpha, beta)
     if objective == "makespan":
         return 1.0, 1.0 / (agents * max(horizon, 1) + 1)
-    if objective == "moves":
-        return 0.0, 1.0
-    if objective != "weighted":
-        raise InputError("--objective", f"{objective!r} is not allowed; makespan, moves, weighted")
-    if not (alpha >= 0 and beta >= 0 and 0 < alpha + beta < math.inf):
-        raise InputError("--objective weighted", f"alpha {alpha} and beta {beta} are not allowed; "
-                         "both at least 0, one above 0")
-    return alpha, beta
+    return (0.0, 1.0) if objective == "moves" else (alpha, beta)
 
 
 def value_of(objective: Objective, alpha: float, beta: float, makespan: float,

@@ -1,0 +1,162 @@
+"""Networks as they decide for a batch of episodes, whatever they are made of.
+
+Legend: E episodes of a batch, N agents, M targets, W columns, H rows (of the map) or units (of
+memory), L kinds of robots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from jax import Array
+
+from moonteam.grid.config import EnvConfig
+from moonteam.grid.observe import observe
+from moonteam.grid.types import State
+from moonteam.policies import entity, recurrent
+from moonteam.policies.entity import EntitySpec
+from moonteam.policies.recurrent import RecurrentSpec
+
+
+class Mission(Protocol):
+    """What says whether a network was made for a mission; `planners.base.Snapshot` is one."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(W, H) cells."""
+        ...
+
+    @property
+    def cells(self) -> npt.NDArray[np.int32]:
+        """[N, 2] of the agents."""
+        ...
+
+    @property
+    def agent_skills(self) -> npt.NDArray[np.int32]:
+        """[N] bitmasks."""
+        ...
+
+    @property
+    def target_cells(self) -> npt.NDArray[np.int32]:
+        """[M, 2]."""
+        ...
+
+    @property
+    def target_skills(self) -> npt.NDArray[np.int32]:
+        """[M] bitmasks."""
+        ...
+
+
+class Brain(Protocol):
+    """A network as it decides for a batch of episodes; hashable, for it is static under jit."""
+
+    @property
+    def travels(self) -> bool:
+        """Whether it reads travel fields where the ground is blocked."""
+        ...
+
+    def slots(self, num_targets: int) -> int:
+        """Target slots that it likes best; sizes between them need no compiling of their own."""
+        ...
+
+    def begin(self, episodes: int, num_agents: int) -> Any:
+        """Empty memory; every array in it begins with the axis E."""
+        ...
+
+    def logits(self, params: Any, memory: Any, states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[Any, Array]:
+        """(memory, [E, N, 5] logits) at a moment of each episode.
+
+        `fields` [E, L, M, H, W] are the steps to each target as in `grid.travel`, None on open
+        maps; `horizon` and `preference` are [E].
+        """
+        ...
+
+    def misfit(self, mission: Mission) -> str:
+        """Why it cannot serve this mission; empty if it can."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecurrentBrain:
+    """The paper's network: one team size, one number of targets, one map."""
+
+    spec: RecurrentSpec
+    travels = False
+
+    def slots(self, num_targets: int) -> int:
+        """Exactly those there are."""
+        return num_targets
+
+    def begin(self, episodes: int, num_agents: int) -> Array:
+        """[E, N, H] zeros."""
+        return recurrent.zeros(self.spec, episodes * num_agents).reshape(
+            episodes, num_agents, -1)
+
+    def logits(self, params: Any, memory: Array, states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[Array, Array]:
+        """See `Brain`; fields, horizon and preference are not among what it observes."""
+        del fields, horizon, preference
+        config = EnvConfig(normalize_positions=self.spec.normalise)
+        obs = jax.vmap(partial(observe, config))(states)  # [E, N, D]
+        rows = obs.reshape(1, -1, obs.shape[-1])
+        never = jnp.zeros(rows.shape[:2], bool)
+        net = recurrent.actor(self.spec)
+        before = memory.reshape(rows.shape[1], -1)
+        result: Any = net.apply({"params": params["actor"]}, before, rows, never)
+        after, out = result
+        return after.reshape(memory.shape), out[0].reshape(*obs.shape[:2], -1)
+
+    def misfit(self, mission: Mission) -> str:
+        """See `Brain`."""
+        spec = self.spec
+        have = (len(mission.cells), len(mission.target_cells), tuple(mission.size))
+        made = (spec.num_agents, spec.num_targets, tuple(spec.size))
+        if have != made:
+            return f"made for {_family(*made)}; this mission has {_family(*have)}"
+        skills = int(max(mission.agent_skills.max(), mission.target_skills.max()))
+        if skills >= 2**spec.num_skills:
+            return f"made for {spec.num_skills} skills; this mission has more"
+        return ""
+
+
+def _family(agents: int, targets: int, size: tuple[int, ...]) -> str:
+    return f"{agents} robots and {targets} targets on a map of {size[0]} x {size[1]}"
+
+
+@dataclass(frozen=True)
+class EntityBrain:
+    """The network for any team, any targets, any ground; it has no memory."""
+
+    spec: EntitySpec
+    travels = True
+
+    def slots(self, num_targets: int) -> int:
+        """The next multiple of four; padding changes nothing."""
+        return -(-num_targets // 4) * 4
+
+    def begin(self, episodes: int, num_agents: int) -> tuple[()]:
+        """Nothing."""
+        del episodes, num_agents
+        return ()
+
+    def logits(self, params: Any, memory: tuple[()], states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[tuple[()], Array]:
+        """See `Brain`; what is returned are log-probabilities."""
+
+        def look(state: State, horizon: Any, preference: Array, fields: Array | None) -> Any:
+            return entity.look(state, horizon, preference, fields)
+
+        view = jax.vmap(look)(states, horizon, preference, fields)
+        return memory, entity.decide(params, self.spec, view).log_probs
+
+    def misfit(self, mission: Mission) -> str:
+        """See `Brain`: everything fits."""
+        del mission
+        return ""
