@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
-from moonteam.commands.options import Missions, Reported, Resumable
+from moonteam.commands.options import Missions, Planning, Reported, Resumable
 from moonteam.report import command
 from moonteam.report.command import Aside
 from moonteam.report.progress import say
@@ -22,7 +22,7 @@ PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
 
 
 @dataclass(frozen=True)
-class Args(Missions, Resumable, Reported):
+class Args(Planning, Missions, Resumable, Reported):
     """Execute random missions in physics and compare what they cost with the grid's promise.
 
     Each mission has one robot of each of our own kinds with random skills, random targets
@@ -52,14 +52,10 @@ class Args(Missions, Resumable, Reported):
     """Which baselines stand in the table."""
     mode: tuple[Literal["barrier", "async"], ...] = ("barrier",)
     """barrier: all robots decide together; async: each when it arrives (closed, oracle)."""
-    planner: tuple[Literal["policy", "exact", "greedy"], ...] = ("policy",)
-    """Who decides: a learned policy, the exact planner, or greedy insertion."""
-    policy: str = "any_team"
-    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
-    decode: str = "argmax"
-    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
-    objective: Literal["makespan", "moves", "weighted"] = "makespan"
-    """What the planner minimises (exact, greedy, and policy with best-of-K)."""
+    planner: tuple[str, ...] = ("policy",)
+    """Who decides: registered planners (policy, exact, greedy, lns, cpsat, exhaustive,
+    another package's), or
+    FILE.py:OBJECT."""
     cell: float = 1.0
     """Metres a side of a cell."""
     lose: float = 0.0
@@ -130,9 +126,7 @@ def _evaluation(args: Args) -> Evaluation:
     rates = Rates(args.lose, args.slow, args.silent, args.new_targets, args.impassable)
     recipes = [Recipe(site, args.site_seed, args.seed, args.targets, args.side, args.cell,
                       args.max_steps, rates) for site in args.site]
-    who = [Contender("closed", "barrier", name, args.policy if name == "policy" else None,
-                     args.decode if name == "policy" else "argmax", args.objective)
-           for name in args.planner]
+    who = [Contender.of(name, args.planner_options()) for name in args.planner]
     return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who, args.backend),
                       args.seed, args.width, args.threads)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 
 from moonteam import files
-from moonteam.commands.options import Missions, Reported, Resumable
+from moonteam.commands.options import Missions, Planning, Reported, Resumable
 from moonteam.report import command
 from sim2grid.study import journal
 from sim2grid.study.journal import Journal
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args(Missions, Resumable, Reported):
+class Args(Planning, Missions, Resumable, Reported):
     """Draw success and mission seconds against slope, boulders, friction, noise and delay.
 
     One quantity is varied at a time over random missions of one site, as in `moonteam evaluate
@@ -51,12 +51,10 @@ class Args(Missions, Resumable, Reported):
     """Missions for each value."""
     mode: tuple[Literal["barrier", "async"], ...] = ("async",)
     """barrier: all robots decide together; async: each when it arrives."""
-    planner: Literal["policy", "exact", "greedy"] = "exact"
-    """Who decides."""
-    policy: str = "any_team"
-    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
-    decode: str = "argmax"
-    """How actions are read from the policy: argmax, sample or best-of-K."""
+    planner: str = "exact"
+    """Who decides: a registered planner (policy, exact, greedy, lns, cpsat, exhaustive,
+    another package's), or
+    FILE.py:OBJECT."""
     side: int = 16
     """Cells of a side of the map, each a metre."""
     backend: Literal["native", "mjx"] = "native"
@@ -77,9 +75,7 @@ def run(args: Args) -> int:
     from sim2grid.study.fleet import Recipe
     from sim2grid.study.sensitivity import run_setting, settings
 
-    who = Contender("closed", "barrier", args.planner,
-                    args.policy if args.planner == "policy" else None,
-                    args.decode if args.planner == "policy" else "argmax")
+    who = Contender.of(args.planner, args.planner_options())
     maker(who)  # refuses a policy that is not there before anything is written
     chosen = contenders(("closed",), args.mode, [who], [args.backend])
     recipe = Recipe(args.site, args.site_seed, args.seed, args.targets, args.side,

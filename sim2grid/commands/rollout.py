@@ -14,7 +14,7 @@ import numpy.typing as npt
 import tyro
 
 from moonteam import __version__, files, paths
-from moonteam.commands.options import Printed
+from moonteam.commands.options import Planning, Printed
 from moonteam.errors import InputError
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import Mission
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Args(Printed):
+class Args(Planning, Printed):
     """Run a mission in physics: a video, a map of the paths and a report.
 
     The planner decides on the grid; every move becomes a waypoint that a simulated robot has to
@@ -52,14 +52,10 @@ class Args(Printed):
 
     mission: tyro.conf.Positional[str] = ""
     """Mission file (.yaml) or the name of a bundled mission; not with --from."""
-    planner: Literal["policy", "exact", "greedy"] = "policy"
-    """Who decides: a learned policy, the exact planner, or greedy insertion."""
-    policy: str = "any_team"
-    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
-    decode: str = "argmax"
-    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
-    objective: Literal["makespan", "moves", "weighted"] = "makespan"
-    """What the planner minimises (exact, greedy, and policy with best-of-K)."""
+    planner: str = "policy"
+    """Who decides: a registered planner (policy, exact, greedy, lns, cpsat, exhaustive,
+    another package's), or
+    FILE.py:OBJECT."""
     mode: Literal["barrier", "async"] = "barrier"
     """barrier: all robots decide together; async: each decides when it arrives."""
     backend: Literal["mjx", "native"] = "mjx"
@@ -81,7 +77,8 @@ class Args(Printed):
     """Show the mission in a live 3-D window while it runs; needs a display."""
 
 
-FROM_REPORT = ("planner", "policy", "decode", "objective", "mode", "backend", "seed")
+FROM_REPORT = ("planner", "policy", "decode", "objective", "alpha", "beta", "time_limit",
+               "preference", "mode", "backend", "seed")
 """Options that a report answers for its missions."""
 
 
@@ -213,10 +210,8 @@ def _load(name: str) -> Mission:
 
 def _planner(args: Args) -> Planner:
     from moonteam.planners import registry
-    from moonteam.planners.kind import PlannerOptions
 
-    return registry.make(args.planner, PlannerOptions(
-        args.objective, policy=args.policy, decode=args.decode))
+    return registry.make(args.planner, args.planner_options())
 
 
 def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:

@@ -11,11 +11,14 @@ import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import tyro
 
 from moonteam.report.command import Aside
+
+if TYPE_CHECKING:
+    from moonteam.planners.kind import PlannerOptions
 
 T = TypeVar("T")
 
@@ -119,3 +122,31 @@ class Missions(Seeded):
     """Cells of a side of the map."""
     max_steps: int = 128
     """Joint decisions after which a mission has failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planning:
+    """What one planner, or each of several, is made from."""
+
+    objective: Literal["makespan", "moves", "weighted"] = "makespan"
+    """Least makespan (and then few moves), fewest moves, or alpha * makespan + beta * moves; of a
+    policy only where it decodes best-of-K."""
+    alpha: float = 1.0
+    """Weight of the makespan in the objective weighted."""
+    beta: float = 0.05
+    """Weight of the moves in the objective weighted."""
+    time_limit: float | None = None
+    """Seconds after which exact, lns and cpsat return the best plan they have."""
+    policy: str = "any_team"
+    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
+    decode: str = "argmax"
+    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
+    preference: float = 0.0
+    """0 (time) to 1 (effort), for a policy that takes one."""
+
+    def planner_options(self, seed: int = 0) -> PlannerOptions:
+        """As planners take them. Raises InputError naming the option at fault."""
+        from moonteam.planners.kind import PlannerOptions
+
+        return PlannerOptions(self.objective, self.alpha, self.beta, self.time_limit, seed,
+                              self.policy, self.decode, self.preference)

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from moonteam import files, paths
-from moonteam.commands.options import Printed, Saved
+from moonteam.commands.options import Planning, Printed, Saved
 from moonteam.errors import InputError
-from moonteam.planners.base import Objective, Plan, Snapshot
-from moonteam.planners.kind import PlannerOptions
+from moonteam.planners.base import Plan, Snapshot
 from moonteam.problem import scenario
 from moonteam.problem.scenario import Scenario
 from moonteam.report.progress import busy
 
-PlannerName = Literal["exact", "greedy", "lns", "cpsat", "exhaustive", "policy"]
-
 
 @dataclass(frozen=True)
-class Args(Saved, Printed):
+class Args(Planning, Saved, Printed):
     """Plan a scenario: who goes where, with whom and when; with a certificate if exact.
 
     SCENARIO is a scenario file (.json), one line of a set (set.jsonl:INDEX, counted from 0,
@@ -39,23 +35,10 @@ class Args(Saved, Printed):
 
     scenario: tyro.conf.Positional[str]
     """Scenario, set.jsonl:INDEX or set.jsonl:ID, or mission."""
-    planner: PlannerName = "exact"
+    planner: str = "exact"
     """exact (proves its plan the best; up to 12 targets), greedy, lns (large-neighbourhood
-    search), cpsat (needs the extra ortools), exhaustive (up to 6 targets) or policy."""
-    objective: Objective = "makespan"
-    """Least makespan (and then few moves), fewest moves, or alpha * makespan + beta * moves."""
-    alpha: float = 1.0
-    """Weight of the makespan in the objective weighted."""
-    beta: float = 0.05
-    """Weight of the moves in the objective weighted."""
-    time_limit: float | None = None
-    """Seconds after which exact, lns and cpsat return the best plan they have."""
-    policy: str = "any_team"
-    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
-    decode: str = "argmax"
-    """How actions are read from the policy: argmax, sample or best-of-K such as best-of-16."""
-    preference: float = 0.0
-    """0 (time) to 1 (effort), for a policy that takes one."""
+    search), cpsat (needs the extra ortools), exhaustive (up to 6 targets), policy, another
+    package's, or FILE.py:OBJECT."""
     seed: int = 0
     """Seed of lns and of a policy that samples."""
 
@@ -125,13 +108,7 @@ def make_plan(args: Args, snapshot: Snapshot) -> Plan:
         from moonteam import compilation
 
         compilation.enable_cache()
-    return registry.make(args.planner, options_of(args)).plan(snapshot)
-
-
-def options_of(args: Args) -> PlannerOptions:
-    """What the planner is made from. Raises InputError."""
-    return PlannerOptions(args.objective, args.alpha, args.beta, args.time_limit, args.seed,
-                          args.policy, args.decode, args.preference)
+    return registry.make(args.planner, args.planner_options(args.seed)).plan(snapshot)
 
 
 def print_plan(case: Case, plan: Plan, alpha: float, beta: float) -> None:
@@ -179,7 +156,7 @@ def _verdict(plan: Plan, alpha: float, beta: float) -> str:
 
 def run(args: Args) -> int:
     """Plans, prints, and draws; 1 if there is no plan."""
-    options_of(args)
+    args.planner_options(args.seed)
     case = load_case(args.scenario)
     with busy("planning; the first time on a machine it compiles for a minute"):
         plan = make_plan(args, Snapshot.start(case.scenario))
