@@ -56,7 +56,8 @@ class Range(Base):
     def act(self, snapshot): return np.full(len(snapshot.cells), 7, np.int32)
 
 class Closed(Base):
-    def act(self, snapshot): return np.array([3, 4, 4], np.int32)
+    def act(self, snapshot):
+        return np.where(snapshot.agent_mask, [3, 4, 4], 4).astype(np.int32)
 
 class Lost(Base):
     def act(self, snapshot): return np.zeros(len(snapshot.cells), np.int32)
