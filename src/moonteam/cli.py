@@ -37,6 +37,8 @@ COMMANDS = {
         "moonteam.commands.evaluate_traverse", "each kind of robot on its own over a site"),
     "evaluate slopes": (
         "moonteam.commands.evaluate_slopes", "how steep each kind of robot can go"),
+    "check robot": (
+        "moonteam.commands.check_robot", "whether a kind of robot keeps what all must keep"),
     "check planner": (
         "moonteam.commands.check_planner", "whether a planner keeps what all must keep"),
     "export": ("moonteam.commands.export", "a policy as an ONNX file that runs without JAX"),
