@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -118,7 +118,7 @@ class _Trial:
 
     def _command(self, ahead: float, speed: float) -> Command:
         x, y = self.scene.qpos0[self.scene.robots[0].qpos][:2]
-        return Command(np.array([x + ahead, y], np.float32), np.float32(speed), np.array(False))
+        return _asked(np.array([x + ahead, y], np.float32), np.float32(speed), np.array(False))
 
     def _drive(self, command: Command, seconds: float, ahead: float | None = None) -> Drive:
         """Runs from the start; with `ahead`, until REST_SECONDS after it came so far."""
@@ -269,10 +269,10 @@ def _survives(trial: _Trial) -> str:
     rng = np.random.default_rng(0)
     qpos[1:] += rng.normal(0.0, 3.0, (STATES - 1, model.nq)).astype(np.float32)
     qvel[1:] += rng.normal(0.0, 5.0, (STATES - 1, model.nv)).astype(np.float32)
-    states = jax.vmap(kind.init)(qpos, qvel)  # before the bad numbers come
+    states = jax.vmap(kind.init)(jnp.asarray(qpos), jnp.asarray(qvel))  # before the bad numbers come
     qpos[1], qvel[2], qpos[3, 3:7] = np.nan, np.inf, 0.0
     lost = np.arange(STATES) % 7 == 6
-    commands = Command(rng.normal(0.0, 9.0, (STATES, 2)).astype(np.float32),
+    commands = _asked(rng.normal(0.0, 9.0, (STATES, 2)).astype(np.float32),
                        rng.uniform(-1.0, 3.0, STATES).astype(np.float32), lost)
     ctrl, _, told = _batched(kind)(states, jnp.float32(0.1), qpos, qvel, commands, _level())
     ctrl = np.asarray(ctrl)
@@ -290,7 +290,7 @@ def _batches(trial: _Trial) -> str:
     states, qpos, qvel = _standing(kind, model, TWINS)
     qpos[:, :2] += np.linspace(0.0, 0.3, TWINS)[:, None]
     goals = np.stack([np.linspace(1.0, 4.0, TWINS), np.ones(TWINS)], axis=1)
-    commands = Command(goals.astype(np.float32), np.full(TWINS, kind.speed, np.float32),
+    commands = _asked(goals.astype(np.float32), np.full(TWINS, kind.speed, np.float32),
                        np.zeros(TWINS, bool))
     together, after, told = _batched(kind)(
         states, jnp.float32(0.1), qpos, qvel, commands, _level())
@@ -327,11 +327,16 @@ def _engines(trial: _Trial) -> str:
            f"{1000 * DRIFT:.0f})"
 
 
+def _asked(xy: Any, speed: Any, lost: Any) -> Command:
+    """A command of host arrays, which jitted controllers take as well."""
+    return Command(xy, speed, lost)
+
+
 def _standing(kind: RobotKind, model: mujoco.MjModel, count: int):
     """Controller states, qpos [count, nq] and qvel [count, nv], all standing at the origin."""
     pose = np.concatenate([[0, 0, kind.spawn_height, 1, 0, 0, 0], kind.home]).astype(np.float32)
     qpos, qvel = np.tile(pose, (count, 1)), np.zeros((count, model.nv), np.float32)
-    return jax.vmap(kind.init)(qpos, qvel), qpos, qvel
+    return jax.vmap(kind.init)(jnp.asarray(qpos), jnp.asarray(qvel)), qpos, qvel
 
 
 def _batched(kind: RobotKind):
