@@ -269,7 +269,8 @@ def _survives(trial: _Trial) -> str:
     rng = np.random.default_rng(0)
     qpos[1:] += rng.normal(0.0, 3.0, (STATES - 1, model.nq)).astype(np.float32)
     qvel[1:] += rng.normal(0.0, 5.0, (STATES - 1, model.nv)).astype(np.float32)
-    states = jax.vmap(kind.init)(jnp.asarray(qpos), jnp.asarray(qvel))  # before the bad numbers come
+    start = jnp.asarray(qpos), jnp.asarray(qvel)  # before the bad numbers come
+    states = jax.vmap(kind.init)(*start)
     qpos[1], qvel[2], qpos[3, 3:7] = np.nan, np.inf, 0.0
     lost = np.arange(STATES) % 7 == 6
     commands = _asked(rng.normal(0.0, 9.0, (STATES, 2)).astype(np.float32),
