@@ -11,7 +11,7 @@ from moonteam.commands.options import Missions, Reported
 from moonteam.errors import InputError
 
 if TYPE_CHECKING:
-    from sim2grid.loop.fused import Decider
+    from sim2grid.loop.fused.deciders import Decider
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def run(args: Args) -> int:
 
 def _decider(args: Args) -> tuple[Decider, Any]:
     """Who decides, and its parameters. Raises InputError for no such policy."""
-    from sim2grid.loop.fused import FirstOpen, PolicyDecider
+    from sim2grid.loop.fused.deciders import FirstOpen, PolicyDecider
 
     if args.planner == "first":
         return FirstOpen(), None

@@ -77,5 +77,11 @@ def prepare(mission: Mission, source: object) -> Prepared:
     scene = build_scene(site, [
         Placement(robot.name, kinds[robot.kind], (float(x), float(y)))
         for robot, (x, y) in zip(mission.robots, starts, strict=True)])
-    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.flies) for r in scene.robots)
-    return Prepared(written, mission, kinds, frame, site, passable, scenario, scene, bodies)
+    return Prepared(written, mission, kinds, frame, site, passable, scenario, scene,
+                    bodies_of(scene))
+
+
+def bodies_of(scene: Scene) -> tuple[Body, ...]:
+    """The robots of a scene as the executor needs to know them."""
+    return tuple(Body(robot.qpos.start, robot.kind.speed, robot.kind.flies, robot.kind.fall_tilt)
+                 for robot in scene.robots)

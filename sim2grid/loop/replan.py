@@ -17,6 +17,7 @@ from moonteam.planners.base import Planner, Snapshot
 from moonteam.planners.search.travel import UNREACHABLE, travel_times
 from moonteam.problem.mission import Mission, Target
 from moonteam.problem.scenario import Scenario
+from sim2grid.loop import rules
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -67,30 +68,9 @@ def without_cell(snapshot: Snapshot, kind: int, cell: npt.NDArray[np.int32]) -> 
     return replace(snapshot, passable=passable)
 
 
-def contributors(snapshot: Snapshot, present: BoolArray, target: int) -> list[int]:
-    """Robots among those `present` [R] whose skills meet the target now; empty if they do not."""
-    need = int(snapshot.target_skills[target])
-    sharing = [i for i in np.flatnonzero(present & snapshot.agent_mask).tolist()
-               if int(snapshot.agent_skills[i]) & need]
-    if not _met(snapshot, sharing, target):
-        return []
-    return sharing
-
-
 def unsolvable(snapshot: Snapshot) -> list[int]:
     """Open targets that the robots still in the team can never solve."""
-    live = np.flatnonzero(snapshot.agent_mask).tolist()
-    reachable = travel_times(snapshot).start < UNREACHABLE  # [R, M]
-    lost = []
-    for j in np.flatnonzero(~snapshot.solved).tolist():
-        if not _met(snapshot, [i for i in live if reachable[i, j]], j):
-            lost.append(j)
-    return lost
-
-
-def _met(snapshot: Snapshot, robots: list[int], target: int) -> bool:
-    need = int(snapshot.target_skills[target])
-    have = 0
-    for i in robots:
-        have |= int(snapshot.agent_skills[i])
-    return have & need == need if snapshot.target_and[target] else have & need != 0
+    reach = travel_times(snapshot).start < UNREACHABLE  # [R, M]
+    return np.flatnonzero(rules.unsolvable(
+        reach, snapshot.agent_mask, snapshot.agent_skills, snapshot.target_skills,
+        snapshot.target_and, snapshot.solved)).tolist()

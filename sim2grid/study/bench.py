@@ -16,7 +16,9 @@ from moonteam.planners.base import Snapshot
 from moonteam.planners.learned import state_of
 from sim2grid.loop.drive import run
 from sim2grid.loop.execution import Execution
-from sim2grid.loop.fused import SUCCESS, Decider, Fused
+from sim2grid.loop.fused.deciders import Decider
+from sim2grid.loop.fused.program import Fused
+from sim2grid.loop.fused.state import SUCCESS
 from sim2grid.study.fleet import Fleet
 
 

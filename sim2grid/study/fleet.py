@@ -42,6 +42,7 @@ from moonteam.terrain.site import for_mission
 from moonteam.terrain.traversability import passable_cells
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body
+from sim2grid.loop.prepare import bodies_of
 from sim2grid.loop.replan import grid_problem, unsolvable, with_target
 from sim2grid.waypoints import waypoints
 
@@ -133,11 +134,10 @@ def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
         for robot, placement in zip(scene.robots, placements(mission, frame), strict=True):
             pose[robot.qpos] = start_pose(site, placement)
         starts.append(pose)
-    bodies = tuple(Body(r.qpos.start, r.kind.speed, r.kind.flies) for r in scene.robots)
     return Fleet(tuple(chosen), tuple(draws),
                  tuple(grid_problem(mission, passable) for mission in chosen),
-                 frame, site, passable, {r.kind.name: r.kind for r in scene.robots}, scene, bodies,
-                 np.stack(starts))
+                 frame, site, passable, {r.kind.name: r.kind for r in scene.robots}, scene,
+                 bodies_of(scene), np.stack(starts))
 
 
 def placements(mission: Mission, frame: Frame) -> list[Placement]:

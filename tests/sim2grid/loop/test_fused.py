@@ -1,100 +1,186 @@
-"""The fused program against the step-by-step executor, on a small mission of two drones."""
+"""The fused program against the step-by-step executor: mixed teams, decision by decision."""
+
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 import pytest
 
+from moonteam import paths
+from moonteam.errors import InputError
 from moonteam.physics.backends import MjxBackend
 from moonteam.planners.base import Snapshot
-from moonteam.planners.learned import state_of
+from moonteam.planners.exact import ExactPlanner
+from moonteam.planners.learned import LearnedPlanner, state_of
 from moonteam.policies import entity
 from moonteam.policies.brain import EntityBrain
-from sim2grid.loop import fused, fused_record
+from moonteam.policies.policy import Policy
+from moonteam.problem.scenario import ACTIONS
+from moonteam.terrain.site import for_mission
 from sim2grid.loop.drive import run
 from sim2grid.loop.execution import Execution
-from sim2grid.loop.prepare import prepare
-from sim2grid.measure.metrics import make_report
+from sim2grid.loop.fused.deciders import PolicyDecider, decider_of
+from sim2grid.loop.fused.program import Fused
+from sim2grid.loop.fused.told import record_of
+from sim2grid.loop.rules import Rules
 from sim2grid.study.bench import DeciderPlanner
-from sim2grid.waypoints import waypoints
+from sim2grid.study.fleet import fleet_of
 
-SECONDS = 40.0
+LOOK = 0.2 + 1e-3  # seconds, single precision among them
+TEAM = (("hopper", "drone"), ("strider", "legged"), ("rover", "wheeled"))
+OVER = (0.0, 1.0, 0.0, 0.0)  # quaternion of a robot on its back
+
+
+@dataclass(frozen=True)
+class Script:
+    """Joint actions read from `params` [B, D, R]; the last one goes on."""
+
+    def begin(self, missions, robots):
+        return jnp.arange(missions)
+
+    def decide(self, params, memory, states, fields, horizon):
+        row = jnp.minimum(states.step, params.shape[1] - 1)
+        return memory, params[memory, row]
+
+
+def actions(*steps):
+    """[D, R] of strings such as "right stay up"."""
+    return np.array([[ACTIONS.index(word) for word in step.split()] for step in steps], np.int32)
+
+
+def team(mission, starts, targets, size, cell_m=1.0, max_steps=6):
+    """A mission of drone (A), legged (B) and wheeled (C) at three starts "x y"."""
+    robots = [f"{name} {kind} {skill} {start}" for (name, kind), skill, start
+              in zip(TEAM, "ABC", starts, strict=True)]
+    return mission(robots, targets, size, cell_m=cell_m, site={"preset": "flat"},
+                   max_steps=max_steps)
+
+
+def fleet(missions):
+    """Missions of one team on flat, open ground."""
+    width, height = missions[0].map.size
+    free = {kind: np.ones((height, width), bool) for _, kind in TEAM}
+    return fleet_of(missions, [1] * len(missions), for_mission(missions[0]), free)
+
+
+def both(crew, backend, decider, params, bodies, rules, max_steps):
+    """Records of all missions of a fleet: (fused, step by step), in pairs."""
+    program = Fused(backend, crew.frame, bodies, decider, max_steps=max_steps, rules=rules,
+                    seconds=None)
+    outcome = program.run(crew.scenarios, crew.starts, params)
+    executions = [
+        Execution(m, s, DeciderPlanner(decider, params[k:k + 1]), bodies, crew.frame, rules=rules)
+        for k, (m, s) in enumerate(zip(crew.missions, crew.scenarios, strict=True))]
+    run(executions, backend, crew.starts)
+    return [(record_of(program.setup, outcome, k, e.asked.mission, e.asked.scenario), e.record)
+            for k, e in enumerate(executions)]
+
+
+def check_same(ours, theirs):
+    """Cells, actions, solved sets, arrivals and causes decision by decision."""
+    assert (ours.success, ours.failure, ours.detail) == (
+        theirs.success, theirs.failure, theirs.detail)
+    assert len(ours.decisions) == len(theirs.decisions)
+    for one, other in zip(ours.decisions, theirs.decisions, strict=True):
+        assert one.cells.tolist() == other.cells.tolist()
+        assert one.actions.tolist() == other.actions.tolist()
+        assert one.solved.tolist() == other.solved.tolist()
+        assert one.time_s == pytest.approx(other.time_s, abs=LOOK * (1 + one.decision))
+    for one, other in zip(ours.legs, theirs.legs, strict=True):
+        assert (one.robot, one.decision, one.from_cell, one.goal_cell, one.end_cell,
+                one.ended) == (other.robot, other.decision, other.from_cell, other.goal_cell,
+                               other.end_cell, other.ended)
+        assert one.end_s - one.start_s == pytest.approx(other.end_s - other.start_s, abs=LOOK)
+        np.testing.assert_allclose(one.waypoint, other.waypoint, atol=1e-4)
+    assert [(x.robot, x.cause, x.decision) for x in ours.losses] == [
+        (x.robot, x.cause, x.decision) for x in theirs.losses]
+    assert ours.replans == theirs.replans
+    assert [(s.target, s.decision, s.robots) for s in ours.solves] == [
+        (s.target, s.decision, s.robots) for s in theirs.solves]
+
+
+MEETING, APART = ("3 1", "0 0", "1 0"), ("3 1", "3 0", "1 0")  # drone, legged, wheeled
+SIZE = (4, 2)
+STEPS = 7
 
 
 @pytest.fixture(scope="module")
-def prepared(mission):
-    return prepare(mission(["one drone A 0 0", "two drone B 3 1"],
-                           ["A OR 1 0", "B OR 2 1", "A OR 3 0"], (4, 2), cell_m=2.0,
-                           site={"preset": "flat"}, max_steps=12), "test")
+def crew(mission):
+    """Head-on and one behind the other; one on its back that is not needed; one that is."""
+    def of(starts, *targets):
+        return team(mission, starts, targets, SIZE, max_steps=STEPS)
+
+    made = fleet([of(MEETING, "A OR 3 0", "BC AND 1 0", "C OR 0 0"),
+                  of(APART, "A OR 2 1", "B OR 3 1"), of(APART, "A OR 2 1", "C OR 1 1")])
+    rover = made.bodies[2].base
+    made.starts[1:, rover + 3:rover + 7] = OVER
+    return made
 
 
 @pytest.fixture(scope="module")
-def backend(prepared):
-    return MjxBackend(prepared.scene)
+def backend(crew):
+    return MjxBackend(crew.scene)
 
 
-def make(prepared, backend, decider):
-    return fused.Fused(backend, prepared.frame, prepared.bodies, decider,
-                       max_steps=prepared.mission.max_steps, seconds=SECONDS)
+def scripts(*each):
+    """[B, D, R]; whoever has no word left stays."""
+    rows = [actions(*steps, *["stay stay stay"] * (STEPS - len(steps))) for steps in each]
+    return np.stack(rows)
 
 
-def test_the_fused_program_does_what_the_executor_does(prepared, backend):
-    program = make(prepared, backend, fused.FirstOpen())
-    targets = prepared.scenario.targets
-    other = msgspec.structs.replace(prepared.scenario, targets=targets[::-1])
-    outcome = program.run([prepared.scenario, other], prepared.scene.qpos0)
-    planner = DeciderPlanner(fused.FirstOpen())
-    execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
-                          prepared.frame)
-    run([execution], backend, prepared.scene.qpos0)
-    record = fused_record.record_of(program.setup, outcome, 0, prepared.mission,
-                                    prepared.scenario)
-    assert outcome.progress.status[1] == fused.SUCCESS
-    assert outcome.progress.solved_at[1].tolist() != outcome.progress.solved_at[0].tolist()
-    told = execution.record
-    assert told.success
-    assert record.success
-    assert [(s.target, s.decision, s.robots) for s in record.solves] == [
-        (s.target, s.decision, s.robots) for s in told.solves]
-    assert len(record.decisions) == len(told.decisions)
-    for ours, theirs in zip(record.decisions, told.decisions, strict=True):
-        assert ours.time_s == pytest.approx(theirs.time_s, abs=0.21)
-        assert (ours.cells == theirs.cells).all()
-        assert (ours.actions == theirs.actions).all()
-        assert (ours.solved == theirs.solved).all()
-    for ours, theirs in zip(record.legs, told.legs, strict=True):
-        assert (ours.robot, ours.goal_cell, ours.ended) == (
-            theirs.robot, theirs.goal_cell, theirs.ended)
-    report = make_report(record, prepared.mission, prepared.frame, prepared.bases,
-                         planner="first", objective=None, mode="barrier", backend="mjx", seed=0,
-                         grid_plan=None, kinds=prepared.kinds)
-    theirs = make_report(told, prepared.mission, prepared.frame, prepared.bases,
-                         planner="first", objective=None, mode="barrier", backend="mjx", seed=0,
-                         grid_plan=None, kinds=prepared.kinds)
-    assert report.seconds == pytest.approx(theirs.seconds, abs=0.21)
-    for ours, other in zip(report.robots, theirs.robots, strict=True):
-        assert ours.distance_m == pytest.approx(other.distance_m, rel=0.05)
+def test_a_mixed_team_swaps_falls_and_is_lost_alike(crew, backend):
+    joint = scripts(["down right left", "stay stay left"],
+                    ["left up right", "stay stay right"], ["left up right", "stay stay up"])
+    pairs = both(crew, backend, Script(), joint, crew.bodies, Rules(), STEPS)
+    for ours, theirs in pairs:
+        check_same(ours, theirs)
+    calm, fallen, needed = (theirs for _, theirs in pairs)
+    assert calm.success
+    first = [leg for leg in calm.legs if leg.decision == 0]
+    assert [leg.goal_cell for leg in first] == [(3, 0), (1, 0), (1, 0)]  # the rover waits
+    assert (1, 1, (1, 2)) in [(s.target, s.decision, s.robots) for s in calm.solves]
+    assert fallen.success
+    assert [(loss.robot, loss.cause) for loss in fallen.losses] == [(2, "fallen")]
+    assert needed.failure == "unsolvable"
 
 
-def test_waypoints_of_robots_that_share_a_cell(prepared):
-    setup = fused.Setup(prepared.frame, fused.Rules(), (0,) * 5, (1.0,) * 5,
-                        (False, True, False, False, False), 1, 1)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        goals = rng.integers(0, 2, (5, 2))
-        wanted = waypoints(prepared.frame, goals, ~np.array(setup.flies))
-        assert np.allclose(fused._waypoints(setup, jnp.asarray(goals)), wanted, atol=1e-6)
+def test_a_mixed_team_is_late_and_stuck_alike(crew, backend):
+    """The robot on its back is only late, three times; what it could not enter is closed."""
+    hurried = Rules(timeout_base_s=6.0, timeout_factor=1.5, fall_s=60.0)
+    waits = ["stay stay right", "stay stay up", "stay stay left"]
+    joint = scripts(["down right left", "stay stay left"],
+                    [*waits, "left up stay"], waits)
+    pairs = both(crew, backend, Script(), joint, crew.bodies, hurried, STEPS)
+    for ours, theirs in pairs:
+        check_same(ours, theirs)
+    _, late, needed = (theirs for _, theirs in pairs)
+    assert [leg.ended for leg in late.legs if leg.robot == 2][:2] == ["timeout"] * 2
+    assert [(loss.robot, loss.cause) for loss in late.losses] == [(2, "stuck")]
+    assert {"timeout", "impassable"} <= {cause for _, cause in late.replans}
+    assert late.success
+    assert needed.failure == "unsolvable"
 
 
-def test_a_network_decides_for_missions_side_by_side(prepared):
+def test_what_cannot_be_fused_says_what_can():
+    with pytest.raises(InputError, match="allowed: --planner policy"):
+        decider_of(ExactPlanner())
+    policy = Policy.load(paths.find("any_team", "policies", ".safetensors"))
+    with pytest.raises(InputError, match="allowed: --decode argmax"):
+        decider_of(LearnedPlanner(policy, "sample"))
+    decider, params = decider_of(LearnedPlanner(policy))
+    assert isinstance(decider, PolicyDecider)
+    assert params is policy.params
+
+
+def test_a_network_decides_for_missions_side_by_side(crew):
     spec = entity.EntitySpec(width=16, layers=1, heads=2)
-    decider = fused.PolicyDecider(EntityBrain(spec))
+    decider = PolicyDecider(EntityBrain(spec))
     params = entity.init(spec, jax.random.key(0))
-    start = state_of(Snapshot.start(prepared.scenario))
+    start = state_of(Snapshot.start(crew.scenarios[0]))
     states = jax.tree.map(lambda a: np.stack([a, a]), start)
-    _, actions = jax.jit(decider.decide)(params, decider.begin(2, 2), states, None,
-                                         jnp.full(2, 12))
-    assert actions.shape == (2, 2)
-    assert ((actions >= 0) & (actions < 5)).all()
-    assert actions[0].tolist() == actions[1].tolist()
+    _, joint = jax.jit(decider.decide)(params, decider.begin(2, 3), states, None,
+                                       jnp.full(2, 12))
+    assert joint.shape == (2, 3)
+    assert ((joint >= 0) & (joint < 5)).all()
+    assert joint[0].tolist() == joint[1].tolist()
