@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from moonteam.problem import rules as grid_rules
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.frame import Frame, tilt
 
@@ -171,8 +172,7 @@ def met(here: Any, skills: Any, need: Any, both: Any) -> Any:
     have = xp.zeros_like(need)
     for i in range(len(skills)):
         have = have | xp.where(here[i], skills[i], 0).astype(need.dtype)
-    have = have & need
-    return xp.where(both, have == need, have != 0)
+    return grid_rules.met(have, need, both)
 
 
 def unsolvable(reach: Any, in_team: Any, skills: Any, need: Any, both: Any, solved: Any) -> Any:

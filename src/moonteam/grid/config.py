@@ -9,11 +9,10 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from moonteam.errors import InputError
-from moonteam.problem.scenario import ACTIONS, MAX_SKILLS
+from moonteam.problem.scenario import MAX_SKILLS
 
 Phase = Literal["bootstrap", "refinement"]
 PHASES: tuple[Phase, ...] = ("bootstrap", "refinement")
-NUM_ACTIONS = len(ACTIONS)
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ from jax import Array
 
 from moonteam import trees
 from moonteam.grid import rewards
-from moonteam.grid.config import NUM_ACTIONS, EnvConfig
+from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
 from moonteam.grid.sampling import Count, sample
 from moonteam.grid.types import Problem, State, StepResult
-
-STAY = 4
+from moonteam.problem import rules
+from moonteam.problem.rules import NUM_ACTIONS, STAY
 
 
 def reset(config: EnvConfig, key: Array, num_agents: Count | None = None,
@@ -72,9 +72,8 @@ def step(config: EnvConfig, state: State, actions: Array) -> StepResult:
 
 def moved(problem: Problem, cells: Array, actions: Array) -> Array:
     """[N, 2] cells after a joint action; borders and blocked cells turn an agent back."""
-    goal = cells + _displacement(actions)
-    ok = _enterable(problem, goal, problem.agent_kinds) & problem.agent_mask
-    return jnp.where(ok[:, None], goal, cells)
+    return rules.moved(cells, cells + _displacement(actions), problem.agent_mask,
+                       problem.agent_kinds, problem.size, problem.passable)
 
 
 def meets(problem: Problem, cells: Array) -> Array:
@@ -84,9 +83,8 @@ def meets(problem: Problem, cells: Array) -> Array:
     present = jnp.zeros_like(problem.target_skills)
     for i in range(cells.shape[0]):
         present = present | jnp.where(here[i], problem.agent_skills[i], 0)
-    present = present & problem.target_skills
-    every = present == problem.target_skills
-    return jnp.where(problem.target_and, every, present != 0) & problem.target_mask
+    return (rules.met(present, problem.target_skills, problem.target_and)
+            & problem.target_mask)
 
 
 def available(state: State) -> Array:
@@ -101,7 +99,7 @@ def available(state: State) -> Array:
         if action == STAY:
             columns.append(jnp.ones_like(problem.agent_mask))
         else:
-            ok = _enterable(problem, goal, problem.agent_kinds)
+            ok = rules.enterable(goal, problem.agent_kinds, problem.size, problem.passable)
             columns.append(ok & problem.agent_mask)
     return jnp.stack(columns, axis=1)
 
@@ -145,15 +143,6 @@ def _displacement(actions: Array) -> Array:
     right = (actions == 3).astype(jnp.int32) - (actions == 2).astype(jnp.int32)
     up = (actions == 0).astype(jnp.int32) - (actions == 1).astype(jnp.int32)
     return jnp.stack([right, up], axis=1)
-
-
-def _enterable(problem: Problem, cells: Array, kinds: Array) -> Array:
-    """[N] bool: on the map and passable for that agent's kind."""
-    ok = jnp.all((cells >= 0) & (cells < problem.size[None, :]), axis=1)
-    if problem.passable is not None:
-        inside = jnp.clip(cells, 0, problem.size[None, :] - 1)
-        ok = ok & problem.passable[kinds, inside[:, 1], inside[:, 0]]
-    return ok
 
 
 def _replace_solved(problem: Problem, newly: Array) -> tuple[Problem, Array]:

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam.grid import env
-from moonteam.grid.config import NUM_ACTIONS, EnvConfig
+from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
 from moonteam.grid.types import State
+from moonteam.problem.rules import NUM_ACTIONS
 
 ByAgent = dict[str, Array]
 

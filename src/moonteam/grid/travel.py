@@ -13,9 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam.grid.types import Problem
-
-UNREACHABLE = 1 << 20
-"""Distance where there is no way; larger than any path, and safe to add to in int32."""
+from moonteam.problem.rules import DISPLACEMENTS, UNREACHABLE, enterable
 
 
 def distance_fields(passable: Array, targets: Array, size: Array | None = None) -> Array:
@@ -120,12 +118,9 @@ def first_step(problem: Problem, fields: Array | None, cells: Array) -> Array:
         return jnp.stack([up > 0, up < 0, right < 0, right > 0], axis=2)
     here = distances(problem, fields, cells)
     moves = []
-    for dx, dy in ((0, 1), (0, -1), (-1, 0), (1, 0)):
-        goal = cells + jnp.array([[dx, dy]])
-        on_map = jnp.all((goal >= 0) & (goal < problem.size[None, :]), axis=1)
-        inside = jnp.clip(goal, 0, problem.size[None, :] - 1)
-        assert problem.passable is not None
-        free = problem.passable[problem.agent_kinds, inside[:, 1], inside[:, 0]]
-        shorter = distances(problem, fields, inside) == here - 1
-        moves.append(shorter & (on_map & free)[:, None])
+    for shift in DISPLACEMENTS[:4]:
+        goal = cells + shift[None]
+        free = enterable(goal, problem.agent_kinds, problem.size, problem.passable)
+        shorter = distances(problem, fields, jnp.clip(goal, 0, problem.size[None] - 1)) == here - 1
+        moves.append(shorter & free[:, None])
     return jnp.stack(moves, axis=2) & (here < UNREACHABLE)[:, :, None]

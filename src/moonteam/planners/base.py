@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.errors import InputError
+from moonteam.problem import rules
 from moonteam.problem.scenario import ACTIONS, Scenario
 
 IntArray = npt.NDArray[np.int32]
@@ -104,7 +105,7 @@ def solved_now(cells: IntArray, skills: IntArray, target_cells: IntArray, need: 
     """[M] True where the agents now standing in a target's cell meet its requirement."""
     here = (cells[:, None] == target_cells[None]).all(-1)  # [N, M]
     present = np.bitwise_or.reduce(np.where(here, skills[:, None], 0), axis=0)
-    return np.where(both, (present & need) == need, (present & need) != 0)
+    return rules.met(present, need, both)
 
 
 class Visit(msgspec.Struct, frozen=True):

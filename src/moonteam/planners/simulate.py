@@ -1,6 +1,7 @@
-"""The grid's rules on the host: a few lines of NumPy, for replaying plans without JAX.
+"""Plans replayed on the host: a few lines of NumPy, without JAX.
 
-The environment in `moonteam.grid` is the rule; tests hold this twin to it.
+What a move does and what solves a target is in `problem.rules`, for the environment in
+`moonteam.grid` too; tests hold the two to each other.
 """
 
 from __future__ import annotations
@@ -12,12 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.planners.base import BoolArray, IntArray, Snapshot, solved_now
-from moonteam.problem.scenario import ACTIONS
-
-DISPLACEMENTS = np.array([(0, 1), (0, -1), (-1, 0), (1, 0), (0, 0)], np.int32)
-"""Cells (x, y) that each action adds: up, down, left, right, stay."""
-
-STAY = ACTIONS.index("stay")
+from moonteam.problem import rules
+from moonteam.problem.rules import DISPLACEMENTS, STAY
 
 
 def moved(snapshot: Snapshot, actions: npt.ArrayLike) -> IntArray:
@@ -25,15 +22,9 @@ def moved(snapshot: Snapshot, actions: npt.ArrayLike) -> IntArray:
 
     Lost agents (`agent_mask` False) do not move.
     """
-    chosen = np.where(snapshot.agent_mask, np.asarray(actions, np.int32), STAY)
-    wanted = snapshot.cells + DISPLACEMENTS[chosen]
-    width, height = snapshot.size
-    free = (wanted >= 0).all(-1) & (wanted[:, 0] < width) & (wanted[:, 1] < height)
-    if snapshot.passable is not None:
-        x, y = np.where(free[:, None], wanted, snapshot.cells).T
-        here = (wanted == snapshot.cells).all(-1)
-        free &= here | snapshot.passable[snapshot.agent_kinds, y, x]
-    return np.where(free[:, None], wanted, snapshot.cells).astype(np.int32)
+    goal = snapshot.cells + DISPLACEMENTS[np.asarray(actions, np.int32)]
+    return rules.moved(snapshot.cells, goal, snapshot.agent_mask, snapshot.agent_kinds,
+                       snapshot.size, snapshot.passable).astype(np.int32)
 
 
 def holding(snapshot: Snapshot) -> BoolArray:
@@ -100,8 +91,8 @@ def replay_whole(snapshot: Snapshot, actions: IntArray) -> Trace:
     cells = _walked(snapshot, chosen)
     here = (cells[:, :, None] == snapshot.target_cells).all(-1)  # [T + 1, N, M]
     skills = np.where(snapshot.agent_mask, snapshot.agent_skills, 0)[:, None]
-    present = np.bitwise_or.reduce(np.where(here, skills, 0), axis=1) & snapshot.target_skills
-    meets = np.where(snapshot.target_and, present == snapshot.target_skills, present != 0)
+    present = np.bitwise_or.reduce(np.where(here, skills, 0), axis=1)  # [T + 1, M]
+    meets = rules.met(present, snapshot.target_skills, snapshot.target_and)
     solved = np.logical_or.accumulate(meets | snapshot.solved)  # [T + 1, M]
     done = solved.all(-1)
     length = int(done.argmax()) if done.any() else len(chosen)
@@ -112,10 +103,7 @@ def _walked(snapshot: Snapshot, actions: IntArray) -> IntArray:
     """Cells [T + 1, N, 2] of joint actions [T, N]; all steps at once if none is thrown back."""
     ways = np.concatenate([snapshot.cells[None], DISPLACEMENTS[actions]])
     cells = ways.cumsum(0, dtype=np.int32)
-    free = np.all((cells >= 0) & (cells < np.array(snapshot.size)), axis=-1)
-    if snapshot.passable is not None and free.all():
-        free &= snapshot.passable[snapshot.agent_kinds, cells[..., 1], cells[..., 0]]
-    if free[1:].all():
+    if rules.enterable(cells[1:], snapshot.agent_kinds, snapshot.size, snapshot.passable).all():
         return cells
     now = snapshot
     for t, joint in enumerate(actions):

@@ -25,12 +25,11 @@ from jax import Array
 
 from moonteam.errors import InputError
 from moonteam.grid.env import available
-from moonteam.grid.travel import UNREACHABLE, distances, first_step
+from moonteam.grid.travel import distances, first_step
 from moonteam.grid.types import Problem, State
+from moonteam.problem.rules import NUM_ACTIONS, STAY, UNREACHABLE
 from moonteam.problem.scenario import MAX_SKILLS
 
-NUM_ACTIONS = 5
-STAY = 4
 FAR = 1.0e9
 """Stands for minus infinity in masked logits, without its not-a-number."""
 
@@ -59,7 +58,7 @@ class EntitySpec:
 class Entities:
     """What the network sees of one moment; any leading batch axes, here written [B].
 
-    Distances of `grid.travel.UNREACHABLE` or more mean out of reach.
+    Distances of `problem.rules.UNREACHABLE` or more mean out of reach.
     """
 
     agent_cells: Array  # [B, N, 2] cells

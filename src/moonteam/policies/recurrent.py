@@ -19,8 +19,7 @@ from flax import linen as nn
 from jax import Array
 
 from moonteam.errors import InputError
-
-NUM_ACTIONS = 5
+from moonteam.problem.rules import NUM_ACTIONS
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,6 @@ class _Body(NamedTuple):
     feet: Array  # [L, 3] m
     foot_velocity: Array  # [L, 3] m/s
     jacobian: Array  # [L, 3, J] m/rad, foot over joint angle
-    joint_velocity: Array  # [L, J] rad/s
     ground: Array  # [] m, fitted plane under the base
     gradient: Array  # [2] fitted plane's rise in world x and y
     gap: Array  # [L] m, foot over the ground
@@ -193,7 +192,7 @@ def _sense(gait: Gait, qpos: Array, qvel: Array, surface: Surface) -> _Body:
     gap = (feet[:, 2] - below) * normal[:, 2] - FOOT_RADIUS
     return _Body(
         qpos[:3], rotation, velocity, spin, level, feet, foot_velocity, jacobian,
-        joint_velocity, jnp.mean(plane), times(level, rise) / 4.0, gap, normal,
+        jnp.mean(plane), times(level, rise) / 4.0, gap, normal,
     )  # fmt: skip
 
 

@@ -15,13 +15,9 @@ import numpy.typing as npt
 from numba import njit
 
 from moonteam.planners.base import BoolArray, IntArray, Snapshot
+from moonteam.problem.rules import DISPLACEMENTS, STAY, UNREACHABLE
 
-UNREACHABLE = 1 << 20
-"""Steps that stand for "no way"; a dozen of them still add up within 32 bits."""
-
-STAY = 4
-_DX = np.array([0, 0, -1, 1], np.int32)
-_DY = np.array([1, -1, 0, 0], np.int32)
+_DX, _DY = np.ascontiguousarray(DISPLACEMENTS.T)
 
 
 @dataclass(frozen=True)

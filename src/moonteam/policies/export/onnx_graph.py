@@ -25,10 +25,10 @@ import numpy as np
 from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
 
 from moonteam import __version__
-from moonteam.grid.travel import UNREACHABLE
 from moonteam.policies.entity import FAR, EntitySpec
 from moonteam.policies.policy_file import PolicyFile
 from moonteam.policies.recurrent import RecurrentSpec
+from moonteam.problem.rules import UNREACHABLE
 from moonteam.problem.scenario import MAX_SKILLS
 
 OPSET, IR = 17, 9
