@@ -130,7 +130,7 @@ def test_the_best_of_k_is_the_cheapest_of_them_and_ending_early_changes_nothing(
 
 
 def test_weights_decide_which_rollout_is_best(policy):
-    now = moment(3, seed=5)
+    now = moment(3, seed=15)  # where the quickest of them is not the one of fewest moves
     fast, thrifty = (best_of(policy, now, 256, PRICES[k][0]) for k in ("makespan", "effort"))
     assert fast.makespan < thrifty.makespan
     assert fast.moves > thrifty.moves

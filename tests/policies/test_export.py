@@ -63,7 +63,7 @@ def seen(snapshot, preference=0.0):
     (2, 4, None), (3, 4, {"drone": 0.0, "wheeled": 0.3, "legged": 0.2})])
 def test_numpy_alone_builds_what_the_network_sees(agents, targets, blocked):
     snapshot = moment(agents, targets, blocked)
-    fields = None if blocked is None else learned._fields(snapshot, targets)
+    fields = None if blocked is None else learned.fields_of(snapshot, targets)
     look = jax.jit(entity.look, static_argnums=1)
     view = look(learned.state_of(snapshot), snapshot.max_steps, jnp.float32(0.4), fields)
     found = seen(snapshot, 0.4)
