@@ -68,8 +68,9 @@ class Args(Planning, Missions, Resumable, Reported):
     """New targets that appear in mid-mission, each at a random decision."""
     impassable: int = 0
     """Cells on the way of a robot on the ground that turn out closed to its kind."""
-    backend: tuple[Literal["native", "mjx"], ...] = ("native",)
-    """Physics engines: C MuJoCo, MJX for accelerators, or both beside each other."""
+    backend: tuple[Literal["native", "mjx", "fused"], ...] = ("native",)
+    """Physics engines: C MuJoCo, MJX for accelerators, or the whole loop on MJX as one program
+    (closed loop, barrier, a policy's likeliest actions, no events); or several."""
     width: int = 25
     """Worlds that the engine advances together."""
     threads: Aside[int] = 0

@@ -58,8 +58,9 @@ class Args(Planning, Printed):
     FILE.py:OBJECT."""
     mode: Literal["barrier", "async"] = "barrier"
     """barrier: all robots decide together; async: each decides when it arrives."""
-    backend: Literal["mjx", "native"] = "mjx"
-    """Physics engine: MJX (JAX) or C MuJoCo, which is faster on a CPU."""
+    backend: Literal["mjx", "native", "fused"] = "mjx"
+    """Physics engine: MJX (JAX), C MuJoCo, which is faster on a CPU, or the whole loop on MJX as
+    one program, for a policy's likeliest actions in barrier mode."""
     seed: int = 0
     """Seed of what is random in the planner; the ground has its own seed in the mission."""
     report: Annotated[Path | None, tyro.conf.arg(name="from", metavar="REPORT")] = None
@@ -151,6 +152,9 @@ def _check(args: Args) -> None:
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise InputError("--out", f"{args.out} is a file; a folder is needed")
     parse(args.decode)
+    if args.backend == "fused" and args.viewer:
+        raise InputError("--viewer", "shows nothing of --backend fused, which is one program; use "
+                         "mjx or native")
     if args.report is None:
         for name, value in (("--mission", args.number), ("--contender", args.contender)):
             if value is not None:
@@ -179,6 +183,10 @@ def _from_file(args: Args) -> Run:
     plan = _grid_plan(prepared, planner, args.seed)
     execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
                           prepared.frame, seed=args.seed, mode=args.mode)
+    if args.backend == "fused":
+        from sim2grid.loop.fused.whole import check
+
+        check(execution)
     who = args.planner if args.planner != "policy" else f"policy {Path(args.policy).stem}"
     return Run(prepared, execution, prepared.scene.qpos0, plan, args.planner,
                None if args.planner == "policy" else args.objective, args.backend, args.seed,
@@ -242,6 +250,8 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
     from sim2grid.loop.drive import run as run_executions
 
     execution, prepared = made.execution, made.prepared
+    if made.backend == "fused":
+        return _drive_fused(made)
     say(f"moonteam: compiling the {made.backend} physics "
         "(kept for later runs; the first time takes longest)")
     backend = make_backend(made.backend, prepared.scene)
@@ -270,6 +280,19 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
     simulated = execution.record.seconds() - execution.asked.rules.chunk_s
     return {"compile_s": round(looks[0] - begun, 3), "wall_s": round(looks[-1] - begun, 3),
             "real_time_factor": round(simulated / max(running, 1e-9), 3)}
+
+
+def _drive_fused(made: Run) -> dict[str, float]:
+    """Runs the mission as one program; nothing can be seen of it before it is over."""
+    from moonteam.physics.backends import MjxBackend
+    from sim2grid.loop.fused import whole
+
+    say("moonteam: compiling the whole loop as one program")
+    execution = made.execution
+    compiling, running = whole.run([execution], MjxBackend(made.prepared.scene),
+                                   made.start[None], 1)
+    return {"compile_s": round(compiling, 3), "wall_s": round(compiling + running, 3),
+            "real_time_factor": round(execution.record.seconds() / max(running, 1e-9), 3)}
 
 
 def _report(made: Run) -> Report:

@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from moonteam.errors import InputError
+from moonteam.physics.backends import MjxBackend
 from moonteam.planners import registry
 from moonteam.planners.base import Objective, Planner
 from moonteam.planners.kind import PlannerOptions
@@ -32,11 +33,13 @@ from moonteam.report.progress import bar
 from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
+from sim2grid.loop.fused import whole
+from sim2grid.loop.fused.deciders import decider_of
 from sim2grid.loop.record import Record
 from sim2grid.loop.rules import Rules
 from sim2grid.measure.metrics import GridPlan, Report, make_report
 from sim2grid.measure.slip import ground_height
-from sim2grid.study.fleet import Fleet, Recipe, make_fleet
+from sim2grid.study.fleet import Fleet, Rates, Recipe, make_fleet
 from sim2grid.study.ideal import (
     IdealBackend,
     ideal_bodies,
@@ -156,12 +159,23 @@ class Evaluation:
 
     def run(self) -> None:
         """Runs what is not done yet. Raises InputError before a mission that cannot be run."""
+        self._check_fused()
         fleets = [make_fleet(recipe, self.count) for recipe in self.recipes]
         for index, fleet in enumerate(fleets):
             self.entries += [Entry(index * self.count + k, fleet.draws[k], mission)
                              for k, mission in enumerate(fleet.missions)]
         for index, fleet in enumerate(fleets):
             Group(self, fleet, index * self.count).run()
+
+    def _check_fused(self) -> None:
+        """Raises InputError for what the fused program cannot run, before anything is."""
+        for contender in self.contenders:
+            if contender.backend != "fused":
+                continue
+            decider_of(maker(contender)())
+            if any(recipe.rates != Rates() for recipe in self.recipes):
+                raise InputError("--backend fused", "takes missions without events; the other "
+                                 "backends take them: native, mjx")
 
     def sorted_rows(self) -> list[Row]:
         """Rows by site, contender and number, however they came."""
@@ -214,6 +228,10 @@ class Group:
 
         with bar(title, total, done) as update:
             update(done, f"{done} of {total} missions")
+            if contender.backend == "fused":
+                whole.run(executions, MjxBackend(self._fleet.scene), self._fleet.starts[todo],
+                          self._width, finished)
+                return
             run(executions, self._backend(contender.backend), self._fleet.starts[todo],
                 width=self._width, rows=[k % self._width for k in todo], finished=finished)
 
@@ -306,6 +324,8 @@ def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[
         for mode, backend in itertools.product(
                 modes if loop in ("closed", "oracle") else ("barrier",),
                 backends if loop != "grid" else ("native",)):
+            if backend == "fused" and (loop, mode) != ("closed", "barrier"):
+                continue  # it only knows how to decide again, all together
             for who in planners if loop != "oracle" else (exact,):
                 one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
                 if found.setdefault(one.name, one) != one:

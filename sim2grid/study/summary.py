@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from moonteam.report.intervals import Bootstrap, Figure
+from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
 
@@ -207,6 +208,7 @@ def notes(options: dict[str, Any]) -> list[str]:
              "bootstrap intervals over missions",
              "decisions / plan: over those of the same planner on the grid alone; seconds / ideal: "
              "over the grid plan at travelling speed"]
+    found += [LACKS] if "fused" in options.get("backend", ()) else []
     drawn = {key: value for key, value in options.get("rates", {}).items() if value}
     if drawn:
         found.append("events drawn: " + ", ".join(f"{k} {v:g}" for k, v in drawn.items())

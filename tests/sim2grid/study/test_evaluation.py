@@ -321,3 +321,23 @@ def test_on_the_engine_a_mission_does_not_depend_on_its_company():
                        rows={(row.contender, row.number): row for row in rows[:2]})
     alone.run()
     assert alone.sorted_rows()[2] == rows[2]
+
+
+def test_the_fused_backend_stands_in_the_table_or_says_what_it_takes(capsys):
+    words = ["evaluate", "execution", "--site", "flat", "--side", "4", "--targets", "1",
+             "--count", "2", "--width", "2", "--json"]
+    assert main([*words, "--backend", "native", "fused", "--mode", "barrier", "async"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    names = [c["name"] for c in report["contenders"]]
+    assert names == ["closed any_team barrier", "closed any_team barrier fused",
+                     "closed any_team async"]
+    rows = {(row["contender"], row["number"]): row["report"] for row in report["rows"]}
+    for number in range(2):
+        plain, fused = (rows[names[k], number] for k in (0, 1))
+        assert fused["success"]
+        assert fused["decisions"] == plain["decisions"]
+        assert fused["seconds"] == pytest.approx(plain["seconds"], abs=0.5)
+    assert any("fused: the whole loop" in note for note in report["notes"])
+    for refused in (["--planner", "exact"], ["--lose", "1"], ["--decode", "best-of-4"]):
+        assert main([*words, "--backend", "fused", *refused]) == 2
+        assert "--backend fused" in capsys.readouterr().err
