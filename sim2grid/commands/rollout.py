@@ -13,7 +13,7 @@ import msgspec
 import numpy.typing as npt
 import tyro
 
-from moonteam import __version__, files, paths
+from moonteam import files, paths
 from moonteam.commands.options import Planning, Printed
 from moonteam.errors import InputError
 from moonteam.problem import mission as missions
@@ -21,6 +21,7 @@ from moonteam.problem.mission import Mission
 from moonteam.report import command
 from moonteam.report.command import Aside
 from moonteam.report.progress import bar, say
+from moonteam.version import __version__
 
 if TYPE_CHECKING:
     from moonteam.planners.base import Planner
@@ -102,8 +103,38 @@ class Run:
     before: Report | None = None  # what came of it when it was run first
 
 
+@dataclass(frozen=True)
+class Done:
+    """What came of it."""
+
+    made: Run
+    report: Report
+    timing: dict[str, float]
+    out: Path
+    video: Path | None
+    interrupted: bool
+
+
 def run(args: Args) -> int:
-    """Runs the mission and writes its folder; the exit code says whether it succeeded."""
+    """Runs the mission, writes its folder, prints; the exit code says whether it succeeded."""
+    done = carry_out(args)
+    report, before = done.report, done.made.before
+    if done.interrupted:
+        print(f"moonteam: stopped after {report.seconds:g} s of the mission; "
+              f"{done.out}/report.json holds what was done", file=sys.stderr)
+        return 130
+    if args.json:
+        print(files.dump_json(report))
+    else:
+        _show(report, done.timing, done.out, done.video)
+    if before is not None and report != before:
+        print(f"moonteam: not as in {args.report}: {_difference(before, report)}; another "
+              "machine or other versions?", file=sys.stderr)
+    return 0 if report.success else 1
+
+
+def carry_out(args: Args) -> Done:
+    """Runs the mission and writes its folder. Raises InputError before anything is written."""
     _check(args)
     from moonteam.compilation import call_at_once, enable_cache
 
@@ -128,19 +159,10 @@ def run(args: Args) -> int:
     film = _film(made)
     _save_paths(film, out)
     if interrupted:
-        print(f"moonteam: stopped after {report.seconds:g} s of the mission; {out}/report.json "
-              "holds what was done", file=sys.stderr)
-        return 130
+        return Done(made, report, timing, out, None, True)
     video = _save_video(film, made.prepared, out) if args.video else None
     _save_page(made, film, report, timing, out, video)
-    if args.json:
-        print(files.dump_json(report))
-    else:
-        _show(report, timing, out, video)
-    if made.before is not None and report != made.before:
-        print(f"moonteam: not as in {args.report}: {_difference(made.before, report)}; another "
-              "machine or other versions?", file=sys.stderr)
-    return 0 if report.success else 1
+    return Done(made, report, timing, out, video, False)
 
 
 def _check(args: Args) -> None:

@@ -27,7 +27,7 @@ from moonteam.errors import InputError
 from moonteam.physics.backends import MjxBackend
 from moonteam.planners import registry
 from moonteam.planners.base import Objective, Planner
-from moonteam.planners.kind import PlannerOptions
+from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
 from sim2grid.loop.asked import Mode, Route
@@ -83,7 +83,7 @@ class Contender(msgspec.Struct, frozen=True):
     def options(self) -> PlannerOptions:
         """What its planners are made from. Raises InputError."""
         return PlannerOptions(self.objective, self.alpha, self.beta, self.time_limit,
-                              policy=self.policy or "any_team", decode=self.decode,
+                              policy=self.policy or DEFAULT_POLICY, decode=self.decode,
                               preference=self.preference)
 
     @property

@@ -9,9 +9,10 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from moonteam import __version__, files
+from moonteam import files
 from moonteam.errors import InputError
 from moonteam.report.command import flag
+from moonteam.version import __version__
 
 Entry = TypeVar("Entry")
 

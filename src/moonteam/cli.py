@@ -11,8 +11,8 @@ import importlib
 import sys
 from typing import Any
 
-from moonteam import __version__
 from moonteam.errors import InputError
+from moonteam.version import __version__
 
 COMMANDS = {
     "train": ("training.commands.train", "train a grid policy from a preset"),

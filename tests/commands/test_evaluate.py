@@ -206,7 +206,6 @@ def test_a_broken_line_is_named(capsys, tmp_path):
 @pytest.mark.parametrize(("words", "says"), [
     (["--planner", "clever"], "clever: no such planner; registered: exact"),
     (["--objective", "fun"], "'fun' is not one of makespan"),
-    (["--planner", "policy"], "policy file is needed"),
     (["--planner", "policy", "--policy", "POLICY"], "made for 3 robots and 5 targets"),
     (["--planner", "policy", "--policy", "POLICY", "--decode", "best-of-0"], "best-of-K needs"),
     (["--planner", "policy", "--policy", "POLICY", "--decode", "beam"], "'beam' is not one of"),

@@ -102,7 +102,7 @@ def test_bundled_missions_and_sets_are_found(capsys):
 @pytest.mark.parametrize(("words", "message"), [
     (["nowhere.json"], "no such file"),
     (["nowhere"], "bundled missions"),
-    (["3x5"], "is a set; choose one of its scenarios, such as 3x5:0"),
+    (["3x5"], "is a set, which holds 1000 scenarios; choose one, such as 3x5:0"),
     (["SET"], "holds 2 scenarios; choose one"),
     (["SET:7"], "has no scenario '7'; a number 0 to 1 or an id"),
     (["SET:pear"], "has no scenario 'pear'"),

@@ -1,5 +1,8 @@
 """Kinds that missions name: registered, in a file beside the mission, or nobody's."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from moonteam.errors import InputError
@@ -74,3 +77,15 @@ def test_each_mistake_gets_one_line(write, old, new, told):
     assert message.startswith(f"{path}: ")
     assert told in message
     assert "\n" not in message
+
+
+def test_no_line_outside_robots_names_a_kind():
+    top = Path(__file__).parents[2]
+    names = re.compile(r"\b(" + "|".join(OWN) + r")\b", re.IGNORECASE)
+    said = [f"{file.relative_to(top)}:{number}: {line.strip()}"
+            for package in ("src/moonteam", "training", "sim2grid")
+            for file in sorted((top / package).rglob("*.py"))
+            if not file.is_relative_to(top / "src/moonteam/robots")
+            for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+            if names.search(line)]
+    assert not said

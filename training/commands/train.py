@@ -10,6 +10,7 @@ import tyro
 
 from moonteam import files
 from moonteam.commands.options import parse as parse_words
+from moonteam.errors import InputError
 from moonteam.report.command import Aside
 from training.commands.ending import Watched, complete
 from training.mappo import config as configs
@@ -112,13 +113,24 @@ def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
     return _train(args)
 
 
+def folder(args: Args | imitate.Args | refine.Args | compare.Args) -> Path:
+    """The run folder of a training. Raises InputError for a command that trains nothing."""
+    from training.commands import compare, refine
+
+    if isinstance(args, compare.Args) or (isinstance(args, Args) and args.dry_run):
+        raise InputError("train", "trains nothing so, and has no run folder")
+    if isinstance(args, Args):
+        return args.folder(args.config.name, args.config.seed)
+    return args.folder(REFINE if isinstance(args, refine.Args) else args.preset, args.seed)
+
+
 def _train(args: Args) -> int:
     from training import sharding
     from training.mappo.trainee import Mappo
     from training.run.machine import Run
 
     config = args.config
-    out = args.folder(config.name, config.seed)
+    out = folder(args)
     sharding.use_all_cores()
     if args.coordinator:
         sharding.join(args.coordinator, args.processes, args.process)

@@ -18,7 +18,7 @@ class Args(Printed):
     compiling for MJX. Exit code 0 if all checks pass, 1 if one fails.
 
     Examples:
-      moonteam check robot wheeled
+      moonteam check robot my-rover
       moonteam check robot examples/scout/scout.py:SCOUT --json
     """
 

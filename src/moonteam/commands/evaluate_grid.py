@@ -40,12 +40,14 @@ class Args(Drawn, Limited, Reported):
     """Scenario set (.jsonl), scenario (.json), or the name of a bundled set; without it,
     --count scenarios are drawn from --seed."""
     planner: Many[tuple[str, ...]] = ()
-    """exact, greedy, lns, exhaustive, cpsat or policy; again for more rows. Default: exact."""
+    """exact, greedy, lns, exhaustive, cpsat, policy, another package's, or FILE.py:OBJECT;
+    again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves or weighted; again for more rows. Default: makespan, and for best-of-K
     what the preference asks for."""
     policy: Many[tuple[str, ...]] = ()
-    """Policy file (.safetensors) or the name of a bundled policy; again for more."""
+    """Policy file (.safetensors) or the name of a bundled policy; again for more. Default:
+    any_team."""
     preference: Many[tuple[float, ...]] = ()
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()

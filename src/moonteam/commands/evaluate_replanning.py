@@ -34,11 +34,13 @@ class Args(Drawn, Limited, Reported):
     set: tyro.conf.Positional[str | None] = None
     """Scenario set (.jsonl) or the name of a bundled one."""
     planner: Many[tuple[str, ...]] = ()
-    """exact, greedy, lns or policy; again for more rows. Default: exact."""
+    """exact, greedy, lns, policy, another package's, or FILE.py:OBJECT; again for more rows.
+    Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves or weighted; again for more rows. Default: makespan."""
     policy: Many[tuple[str, ...]] = ()
-    """Policy file (.safetensors) or the name of a bundled policy; again for more."""
+    """Policy file (.safetensors) or the name of a bundled policy; again for more. Default:
+    any_team."""
     preference: Many[tuple[float, ...]] = ()
     """0 (time) to 1 (effort), for policies that take one; again for more rows."""
     decode: Many[tuple[str, ...]] = ()

@@ -20,11 +20,19 @@ class Args(Seeded, Reported):
 
     Examples:
       moonteam evaluate timing
+      moonteam evaluate timing --planner lns --planner my_planner.py:Mine --time-limit 0.1
       moonteam evaluate timing --policy small --targets 5 --targets 7 --count 20 --json
     """
 
     targets: Many[tuple[int, ...]] = ()
     """Number of targets; again for more sizes. Default: 3 to 10 and 12."""
+    planner: Many[tuple[str, ...]] = ()
+    """A registered planner or FILE.py:OBJECT; again for more. Default: exact, greedy,
+    exhaustive and policy."""
+    objective: Many[tuple[str, ...]] = ()
+    """makespan, moves or weighted; again for more. Default: all of exact's, else makespan."""
+    time_limit: float | None = None
+    """Seconds a plan that anytime planners (exact, lns, cpsat) may take. Default: theirs."""
     policy: str | None = None
     """Policy file or bundled policy. A recurrent network is rebuilt, untrained, for each number
     of targets; without a file it is the paper's."""
@@ -67,7 +75,9 @@ def _measured(args: Args, cores: str) -> dict:
     from moonteam.report import command
 
     sizes = timing.Sizes(args.targets or (3, 4, 5, 6, 7, 8, 9, 10, 12), args.count, args.agents,
-                         args.side, budget=args.budget, best_of=args.best_of, seed=args.seed)
+                         args.side, budget=args.budget, best_of=args.best_of, seed=args.seed,
+                         planners=args.planner or timing.USUAL, objectives=args.objective,
+                         time_limit=args.time_limit)
     sizes.check()
     policy = Policy.load(paths.find(args.policy, "policies", ".safetensors")) \
         if args.policy else None

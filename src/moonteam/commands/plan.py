@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
-from moonteam import files, paths
+from moonteam import files, loading
 from moonteam.commands.options import Planning, Printed, Saved
 from moonteam.errors import InputError
 from moonteam.planners.base import Plan, Snapshot
 from moonteam.problem import scenario
+from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.report.progress import busy
 
@@ -55,49 +55,22 @@ class Case:
 
 def load_case(name: str) -> Case:
     """The scenario that the command line names. Raises InputError."""
-    if Path(name).suffix in (".yaml", ".yml"):
-        return _mission_case(Path(name))
-    head, colon, which = name.rpartition(":")
-    if colon and not Path(name).exists():
-        return _named(_pick(paths.find(head, "testsets", ".jsonl"), which))
-    path = Path(name)
-    if not path.suffix and not path.exists():
-        bundled = paths.assets()
-        if (bundled / "testsets" / f"{name}.jsonl").is_file():
-            raise InputError(name, f"is a set; choose one of its scenarios, such as {name}:0")
-        return _mission_case(paths.find(name, "missions", ".yaml"))
-    if path.suffix == ".jsonl":
-        found = scenario.load_set(path)
-        if len(found) > 1:
-            raise InputError(path, f"holds {len(found)} scenarios; choose one, such as {path}:0")
-        return _named(found[0])
-    return _named(scenario.load(path))
-
-
-def _pick(path: Path, which: str) -> Scenario:
-    """Scenario number `which` of a set, or the one with that id."""
-    found = scenario.load_set(path)
-    same = [s for s in found if s.id == which]
-    if same:
-        return same[0]
-    if which.isdecimal() and int(which) < len(found):
-        return found[int(which)]
-    raise InputError(path, f"has no scenario {which!r}; a number 0 to {len(found) - 1} or an id, "
-                     f"such as {found[0].id or 'none here'}")
+    found = loading.load(name)
+    if isinstance(found, Mission):
+        return Case(found.scenario(), found.name, tuple(r.name for r in found.robots),
+                    tuple(found.target_name(j) for j in range(len(found.targets))))
+    if isinstance(found, Scenario):
+        return _named(found)
+    if len(found) > 1:
+        raise InputError(name, f"is a set, which holds {len(found)} scenarios; choose one, such "
+                         f"as {name}:0")
+    return _named(found[0])
 
 
 def _named(found: Scenario) -> Case:
     return Case(found, found.id or "scenario",
                 tuple(f"R{i + 1}" for i in range(len(found.agents))),
                 tuple(f"T{j + 1}" for j in range(len(found.targets))))
-
-
-def _mission_case(path: Path) -> Case:
-    from moonteam.robots import team
-
-    found, _ = team.load(path)
-    return Case(found.scenario(), found.name or path.stem, tuple(r.name for r in found.robots),
-                tuple(found.target_name(j) for j in range(len(found.targets))))
 
 
 def make_plan(args: Args, snapshot: Snapshot) -> Plan:

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from moonteam import paths
 from moonteam.errors import InputError
 from moonteam.evaluation import rollouts
 from moonteam.evaluation.metrics import Outcomes
@@ -19,7 +20,7 @@ from moonteam.planners import best_of, registry, simulate
 from moonteam.planners import decode as decoding
 from moonteam.planners.base import IntArray, Objective, Snapshot, WholePlanner, check_objective
 from moonteam.planners.decode import Decode
-from moonteam.planners.kind import PlannerKind, PlannerOptions
+from moonteam.planners.kind import DEFAULT_POLICY, PlannerKind, PlannerOptions
 from moonteam.policies.brain import EntityBrain
 from moonteam.policies.policy import Policy
 from moonteam.report.progress import track
@@ -50,7 +51,7 @@ class Options:
            preference: float = 0.0, policy: str | Path | None = None) -> PlannerOptions:
         """What one planner of them is made from. Raises InputError."""
         return PlannerOptions(objective, self.alpha, self.beta, limit, self.seed,
-                              policy or "any_team", preference=preference)
+                              policy or DEFAULT_POLICY, preference=preference)
 
 
 class Contender(Protocol):
@@ -228,12 +229,11 @@ def called(path: Path) -> str:
 
 def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contender]:
     """The rows of every policy file, preference and decoding."""
-    if not options.policies:
-        raise InputError("--policy", "a policy file is needed with --planner policy")
     decodes = [decoding.parse(text) for text in dict.fromkeys(options.decodes)]
-    policies = [Policy.load(path) for path in options.policies]
+    files = options.policies or [paths.find(DEFAULT_POLICY, "policies", ".safetensors")]
+    policies = [Policy.load(path) for path in files]
     found: list[Contender] = []
-    for path, policy in zip(options.policies, policies, strict=True):
+    for path, policy in zip(files, policies, strict=True):
         stem = "policy" if len(policies) == 1 else called(path)
         given = options.preferences if isinstance(policy.brain, EntityBrain) else ()
         for preference in given or (0.0,):

@@ -16,6 +16,9 @@ from moonteam.planners.decode import Decode
 if TYPE_CHECKING:
     from moonteam.policies.policy import Policy
 
+DEFAULT_POLICY = "any_team"
+"""The bundled policy that decides where none is named."""
+
 
 @dataclass(frozen=True)
 class PlannerOptions:
@@ -34,7 +37,7 @@ class PlannerOptions:
     """Seconds a plan that anytime planners may take; None: theirs."""
     seed: int = 0
     """Of what is random in a whole plan; the closed loop gives one to `reset`."""
-    policy: str | os.PathLike[str] | Policy = "any_team"
+    policy: str | os.PathLike[str] | Policy = DEFAULT_POLICY
     """A policy file or the name of a bundled one, or one that is loaded."""
     decode: str = "argmax"
     """How actions are read from a policy, see `decode.ALLOWED`."""

@@ -7,7 +7,6 @@ import platform
 import subprocess
 from pathlib import Path
 
-import moonteam
 from moonteam.compilation import cores
 
 PACKAGES = ("moonteam", "jax", "jaxlib", "numpy", "numba", "flax")
@@ -15,7 +14,7 @@ PACKAGES = ("moonteam", "jax", "jaxlib", "numpy", "numba", "flax")
 
 def commit() -> str | None:
     """The checkout's commit, with -dirty if code or assets differ; None in a wheel."""
-    folder = Path(moonteam.__file__).resolve().parent
+    folder = Path(__file__).resolve().parents[1]
     top = git(folder, "rev-parse", "--show-toplevel")
     if top is None or not folder.is_relative_to(top) or folder != Path(top) / "src" / "moonteam":
         return None  # a wheel inside some other project's checkout

@@ -35,7 +35,7 @@ def resolve(mission: Mission, source: object) -> tuple[Mission, Kinds]:
     kinds: Kinds = {}
 
     def name_of(written: str, key: str) -> str:
-        kind = KINDS.get(_beside(written, source), source, key)
+        kind = KINDS.get(beside(written, source), source, key)
         if kinds.setdefault(kind.name, kind) is not kind:
             raise InputError(source, f"{written}: another kind is called {kind.name!r} here", key)
         return kind.name
@@ -51,12 +51,32 @@ def resolve(mission: Mission, source: object) -> tuple[Mission, Kinds]:
     return msgspec.structs.replace(mission, robots=robots, events=events), kinds
 
 
+def settled(mission: Mission, source: object) -> Mission:
+    """The mission with kinds that stand in files named by their full paths: it can be written
+    anywhere. Raises InputError as `resolve` does.
+    """
+    resolve(mission, source)
+
+    def full(written: str) -> str:
+        found = beside(written, source)
+        return found if found == written else str(Path(found).resolve())
+
+    return msgspec.structs.replace(
+        mission,
+        robots=tuple(msgspec.structs.replace(robot, kind=full(robot.kind))
+                     for robot in mission.robots),
+        events=tuple(event if event.impassable is None else msgspec.structs.replace(
+            event, impassable=msgspec.structs.replace(
+                event.impassable, kind=full(event.impassable.kind)))
+            for event in mission.events))
+
+
 def limits(kinds: Mapping[str, RobotKind]) -> dict[str, Limits]:
     """What ground each kind can cross."""
     return {name: kind.limits for name, kind in kinds.items()}
 
 
-def _beside(written: str, source: object) -> str:
+def beside(written: str, source: object) -> str:
     """FILE.py:OBJECT with the file looked for in the folder of `source`; a name as it is."""
     file, colon, _ = written.rpartition(":")
     if not (colon and file.endswith(".py")):

@@ -18,9 +18,9 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.grid.scenarios import generate
 from moonteam.planners import registry
-from moonteam.planners.base import OBJECTIVES, Objective, Snapshot, check_objective
+from moonteam.planners.base import OBJECTIVES, Snapshot, check_objective
 from moonteam.planners.best_of import plan_best_of
-from moonteam.planners.kind import PlannerOptions
+from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies import policy_file, recurrent
 from moonteam.policies.brain import EntityBrain, RecurrentBrain
@@ -49,7 +49,7 @@ class Sizes:
     best_of: int = 16
     seed: int = 0
     planners: Sequence[str] = USUAL
-    objectives: Sequence[Objective] = ()  # empty: all of the exact planner, else makespan
+    objectives: Sequence[str] = ()  # empty: all of the exact planner, else makespan
     time_limit: float | None = None  # seconds a plan, of anytime planners
 
     def check(self) -> None:
@@ -109,8 +109,8 @@ def methods(policy: Policy | None, sizes: Sizes, targets: int
         usual = OBJECTIVES if kind.name == "exact" else ("makespan",)
         for objective in sizes.objectives or usual:
             found[f"{kind.name}({objective})"] = registry.make(name, PlannerOptions(
-                objective, time_limit=sizes.time_limit, seed=sizes.seed,
-                policy=policy or "any_team")).plan
+                check_objective(objective, 1.0, 0.05), time_limit=sizes.time_limit, seed=sizes.seed,
+                policy=policy or DEFAULT_POLICY)).plan
     return found
 
 

@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
 
-from moonteam import __version__
 from moonteam.policies.entity import FAR, EntitySpec
 from moonteam.policies.policy_file import PolicyFile
 from moonteam.policies.recurrent import RecurrentSpec
 from moonteam.problem.rules import UNREACHABLE
 from moonteam.problem.scenario import MAX_SKILLS
+from moonteam.version import __version__
 
 OPSET, IR = 17, 9
 _LAST = np.iinfo(np.int64).max

@@ -1,0 +1,213 @@
+"""The public face of moonteam, which `moonteam/__init__.py` names; docs/python.md shows each.
+
+Everything takes what `load` gives, or the name or path of it, and does what the command of the
+same name does, with the same options under the same names.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
+
+from moonteam import files
+from moonteam.errors import InputError
+from moonteam.loading import load
+from moonteam.problem.mission import Mission
+from moonteam.problem.scenario import Scenario
+
+if TYPE_CHECKING:  # JAX and MuJoCo, which take seconds, are loaded when they are needed
+    from moonteam.planners.base import Plan, Planner
+    from moonteam.planners.kind import PlannerKind
+    from moonteam.robots.base import RobotKind
+    from sim2grid.measure.metrics import Report
+
+__all__ = ["evaluate", "load", "plan", "register", "rollout", "train"]
+
+Named = str | os.PathLike[str]
+T = TypeVar("T")
+
+
+def plan(what: Named | Mission | Scenario, planner: str = "exact", **options: Any) -> Plan:
+    """One scenario's plan, as `moonteam plan`.
+
+    Args:
+      what: a mission or scenario, or what `load` takes for one.
+      planner: a registered planner, or `FILE.py:OBJECT`.
+      **options: fields of `PlannerOptions`, such as objective="moves" or time_limit=1.0.
+
+    Returns the plan: `status`, `makespan` and `moves` in steps, `actions` [T, N], `schedule`.
+    Raises InputError for what cannot be.
+    """
+    from moonteam.planners import registry
+    from moonteam.planners.base import Snapshot
+    from moonteam.planners.kind import PlannerOptions
+
+    made = _built(PlannerOptions, "plan", options)
+    if registry.find(planner).wants_policy:
+        from moonteam import compilation
+
+        compilation.enable_cache()
+    return registry.make(planner, made).plan(Snapshot.start(_scenario(what)))
+
+
+def rollout(mission: Named | Mission, planner: str = "policy", *, out: Named | None = None,
+            **options: Any) -> Report:
+    """A mission in physics, as `moonteam rollout`.
+
+    Args:
+      mission: a mission, its file, or the name of a bundled one.
+      planner: who decides; a registered planner, or `FILE.py:OBJECT`.
+      out: output folder; runs/NAME by default. A `Mission` is written there as mission.yaml.
+      **options: of the command, such as backend="native", mode="async" or video=False.
+
+    Returns the report that is written as report.json: SI units, `success`, `seconds`,
+    `targets`, `robots`. Raises InputError, and KeyboardInterrupt when stopped (what was done is
+    saved then).
+    """
+    command = _command("sim2grid", "rollout")
+    if isinstance(mission, Mission):
+        import yaml
+
+        folder = Path(out) if out is not None else Path("runs") / (mission.name or "mission")
+        file = folder / "mission.yaml"
+        files.write_text(file, yaml.safe_dump(msgspec.to_builtins(mission), sort_keys=False))
+    else:
+        file, folder = Path(mission), None if out is None else Path(out)
+    done = command.carry_out(_built(command.Args, "rollout", {
+        "mission": os.fspath(file), "planner": planner, "out": folder, **options}))
+    if done.interrupted:
+        raise KeyboardInterrupt
+    return done.report
+
+
+def evaluate(what: Named | Scenario | Sequence[Scenario],
+             planner: str | Sequence[str] = "exact", *, limit: int | None = None,
+             **options: Any) -> dict[str, Any]:
+    """Planners side by side on scenarios, as `moonteam evaluate grid`.
+
+    Args:
+      what: a set, or scenarios.
+      planner: one planner, or several.
+      limit: only the first so many scenarios.
+      **options: of the command, one value or several: policy="any_team",
+        decode=("argmax", "best-of-16"), time_limit=0.1.
+
+    Returns the report: `summary` has one row a planner, `rows` one a planner and scenario.
+    Raises InputError, and KeyboardInterrupt when stopped.
+    """
+    from moonteam import compilation
+    from moonteam.evaluation import grid
+    from moonteam.evaluation.contenders import contenders
+    from moonteam.report import command as commands
+
+    command = _command("moonteam", "evaluate_grid")
+    named = os.fspath(what) if isinstance(what, (str, os.PathLike)) else None
+    many = ("objective", "policy", "preference", "decode", "time_limit")
+    args = _built(command.Args, "evaluate", {
+        "set": named, "planner": _several(planner), "limit": limit,
+        **{key: _several(value) if key in many else value for key, value in options.items()}})
+    compilation.enable_cache()
+    if isinstance(what, (str, os.PathLike)):
+        found = command.load_set(os.fspath(what), limit)
+        title, made_by = Path(what).stem, commands.line("evaluate grid", args)
+    else:
+        found = [what] if isinstance(what, Scenario) else list(what)[:limit]
+        title, made_by = "scenarios", "moonteam.evaluate"
+    document = grid.evaluate(found, contenders(command.options_of(args)), args.seed,
+                             f"{title}: {len(found)} scenarios", made_by)
+    if "interrupted" in document:
+        raise KeyboardInterrupt
+    return document
+
+
+def train(preset: str, *words: str, out: Named | None = None) -> Path:
+    """Trains a policy, as `moonteam train`.
+
+    Args:
+      preset: such as "quick", "any_team", "small" or "pi_5t".
+      *words: what would stand behind it on the command line, such as "--seed", "1", "--resume".
+      out: run folder; runs/PRESET-SEED by default.
+
+    Returns the run folder, which holds policy.safetensors and report.json. Raises InputError for
+    bad words, KeyboardInterrupt when stopped (go on with "--resume"), RuntimeError if the run
+    failed, which it has said why on standard error.
+    """
+    from moonteam import cli
+
+    command = _command("training", "train")
+    where = () if out is None else ("--out", os.fspath(out))
+    try:
+        args = cli.parse("train", [preset, *words, *where])
+    except SystemExit:
+        raise InputError("train", f"{' '.join([preset, *words])}: not understood, see above"
+                         ) from None
+    folder = command.folder(args)
+    code = command.run(args)
+    if code == 130:
+        raise KeyboardInterrupt
+    if code:
+        raise RuntimeError(f"training {preset} ended with exit code {code}")
+    return folder
+
+
+def register(thing: RobotKind | PlannerKind | Callable[..., Planner], name: str = "") -> None:
+    """Makes a kind of robot or a planner known by name in this process.
+
+    `name` is the object's own where it is left out. Raises InputError if the name is taken, or
+    the thing is neither.
+    """
+    from moonteam.planners import registry
+    from moonteam.planners.kind import PlannerKind
+    from moonteam.robots import KINDS, RobotKind
+
+    if isinstance(thing, RobotKind):
+        if name not in ("", thing.name):
+            raise InputError(name, f"a kind of robot goes by its own name, {thing.name}")
+        KINDS.register(thing.name, thing)
+        return
+    own = name or getattr(thing, "name", "") or getattr(thing, "__name__", "")
+    if not callable(thing) and not isinstance(thing, PlannerKind):
+        raise InputError("register", f"a {type(thing).__name__} is neither a RobotKind nor a "
+                         "planner, which is a class, or a function that makes one")
+    registry.register(str(own), thing)
+
+
+def _command(package: str, name: str) -> Any:
+    """A command's module, found by name: moonteam imports neither training nor sim2grid."""
+    return importlib.import_module(f"{package}.commands.{name}")
+
+
+def _built(kind: type[T], call: str, options: dict[str, Any]) -> T:
+    """The dataclass made from keyword options. Raises InputError for one that it has not."""
+    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    for key in options:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, 1)
+            meant = f"did you mean {near[0]}? " if near else ""
+            raise InputError(f"{call}({key}=)", f"no such option; {meant}allowed: "
+                             + ", ".join(known))
+    return kind(**options)
+
+
+def _several(value: Any) -> tuple:
+    """The values of an option that may be given several times."""
+    return (value,) if isinstance(value, (str, int, float, os.PathLike)) else tuple(value)
+
+
+def _scenario(what: Named | Mission | Scenario) -> Scenario:
+    found = load(what) if isinstance(what, (str, os.PathLike)) else what
+    if isinstance(found, Mission):
+        return found.scenario()
+    if isinstance(found, Scenario):
+        return found
+    if len(found) == 1:
+        return found[0]
+    raise InputError(str(what), f"is a set, which holds {len(found)} scenarios; choose one, such "
+                     f"as {what}:0")

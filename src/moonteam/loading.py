@@ -1,0 +1,62 @@
+"""What a user names, found and read: a mission, a scenario, one of a set, or a whole set."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from moonteam import paths
+from moonteam.errors import InputError
+from moonteam.problem import mission as missions
+from moonteam.problem import scenario
+from moonteam.problem.mission import Mission
+from moonteam.problem.scenario import Scenario
+
+YAML = (".yaml", ".yml")
+
+
+def load(source: str | os.PathLike[str]) -> Mission | Scenario | list[Scenario]:
+    """Reads and checks what `source` names.
+
+    A mission (.yaml), a scenario (.json), a set (.jsonl), one line of a set (`SET:INDEX`,
+    counted from 0, or `SET:ID`), or the name of a bundled mission or set. A mission without a
+    name gets that of its file. Raises InputError naming file, key and what is allowed.
+    """
+    name = os.fspath(source)
+    path = Path(name)
+    head, colon, which = name.rpartition(":")
+    if colon and not path.exists() and path.suffix not in YAML:
+        return pick(paths.find(head, "testsets", ".jsonl"), which)
+    if path.suffix == ".jsonl":
+        return scenario.load_set(path)
+    if path.suffix in YAML or (not path.suffix and not path.exists()):
+        if (paths.assets() / "testsets" / f"{name}.jsonl").is_file():
+            return scenario.load_set(paths.find(name, "testsets", ".jsonl"))
+        return load_mission(name)
+    return scenario.load(path)
+
+
+def load_mission(name: str) -> Mission:
+    """A mission file, or the bundled mission of that name, its kinds of robot found.
+
+    Raises InputError.
+    """
+    from moonteam.robots import team
+
+    path = paths.find(name, "missions", ".yml" if name.endswith(".yml") else ".yaml")
+    found = team.settled(missions.load(path), path)
+    return msgspec.structs.replace(found, name=found.name or path.stem)
+
+
+def pick(path: Path, which: str) -> Scenario:
+    """Scenario number `which` of a set, or the one with that id. Raises InputError."""
+    found = scenario.load_set(path)
+    same = [s for s in found if s.id == which]
+    if same:
+        return same[0]
+    if which.isdecimal() and int(which) < len(found):
+        return found[int(which)]
+    raise InputError(path, f"has no scenario {which!r}; a number 0 to {len(found) - 1} or an id, "
+                     f"such as {found[0].id or 'none here'}")
