@@ -1,0 +1,1 @@
+"""Planning by the clock: one problem, exact search, local search."""

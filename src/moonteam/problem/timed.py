@@ -1,0 +1,241 @@
+"""A planning problem by the clock, as a file: a JSON object with `"clock": "seconds"`.
+
+What a scenario in steps says in cells and moves is said here in places and seconds: positions off
+the lattice, a speed and a home for each agent; for each target a service time, a coalition by
+skill and number, targets that come before it, a time at which it appears and one after which it
+lapses. Everything but places and skills may be left out, and then is the paper's case.
+
+Seconds stand for the file's own unit of time, metres for its unit of length, where it comes from
+others (`source` says so).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import msgspec
+
+from moonteam import files
+from moonteam.errors import InputError
+from moonteam.problem.scenario import MAX_SKILLS, Scenario
+
+Place = tuple[float, float]
+Metric = Literal["straight", "manhattan"]
+
+
+class Agent(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A robot: where it is, m; its speed, m/s; where it has to be at the end, if anywhere."""
+
+    at: Place
+    skills: tuple[str, ...]
+    speed: float = 1.0
+    home: Place | None = None
+    kind: str | None = None
+
+
+class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A place that needs a coalition, all of it there from the service's start to its end.
+
+    `skills` with `type` OR: one agent that has any of them. AND: agents that together have all.
+    `coalition` says more than AND: at least so many agents that have each skill; an agent counts
+    for every skill that it has.
+    """
+
+    at: Place
+    skills: tuple[str, ...] = ()
+    type: Literal["AND", "OR"] = "AND"
+    coalition: dict[str, int] = {}
+    service: float = 0.0
+    """s that the coalition stays."""
+    after: tuple[int, ...] = ()
+    """Targets whose services have ended before this one's starts."""
+    appears: float = 0.0
+    """s before which no service starts; where a mission unfolds, nobody knows of it before."""
+    lapses: float | None = None
+    """s after which no service starts."""
+
+    def needs(self) -> dict[str, int]:
+        """Agents needed of each skill; of an OR target one of each, any of which will do."""
+        return self.coalition or dict.fromkeys(self.skills, 1)
+
+
+class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What is known of the least makespan: proved, a bound, and what others found, by name."""
+
+    makespan: float | None = None
+    bound: float | None = None
+    published: dict[str, float] = {}
+
+
+class Timed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A problem by the clock.
+
+    Its makespan is when the last service has ended and every agent with a home is there again.
+    """
+
+    clock: Literal["seconds"]
+    agents: tuple[Agent, ...]
+    targets: tuple[Target, ...]
+    id: str = ""
+    metric: Metric = "straight"
+    max_seconds: float | None = None
+    optimal: Known | None = None
+    source: str = ""
+    """Where it comes from, with its licence."""
+
+    @property
+    def skill_names(self) -> tuple[str, ...]:
+        """All skills that are had or needed, in sorted order."""
+        return tuple(sorted({s for a in self.agents for s in a.skills}
+                            | {s for t in self.targets for s in t.needs()}))
+
+
+def of(scenario: Scenario) -> Timed:
+    """The scenario by the clock: one cell a second, Manhattan ways. Closed cells are left out."""
+    return Timed(
+        clock="seconds", id=scenario.id, metric="manhattan",
+        max_seconds=float(scenario.max_steps),
+        agents=tuple(Agent((float(a.at[0]), float(a.at[1])), a.skills, kind=a.kind)
+                     for a in scenario.agents),
+        targets=tuple(Target((float(t.at[0]), float(t.at[1])), t.skills, t.type)
+                      for t in scenario.targets))
+
+
+def check(timed: Timed, source: object, where: str = "") -> Timed:
+    """The rules that types cannot say. Raises InputError naming the key and what is allowed."""
+
+    def fail(key: str, problem: str) -> InputError:
+        return InputError(source, problem, f"{where}.{key}" if where else key)
+
+    if not timed.agents:
+        raise fail("agents", "at least one agent is needed")
+    if not timed.targets:
+        raise fail("targets", "at least one target is needed")
+    if len(timed.skill_names) > 8 * MAX_SKILLS:
+        raise fail("agents", f"{len(timed.skill_names)} different skills; at most "
+                   f"{8 * MAX_SKILLS} are allowed")
+    if timed.max_seconds is not None:
+        _positive(timed.max_seconds, lambda p: fail("max_seconds", p))
+    for i, agent in enumerate(timed.agents):
+        _check_agent(agent, lambda key, problem, i=i: fail(f"agents[{i}].{key}", problem))
+    for j, target in enumerate(timed.targets):
+        say = lambda key, problem, j=j: fail(f"targets[{j}].{key}", problem)  # noqa: E731
+        check_target(target, len(timed.targets), j, say)
+        check_coalition(target, [agent.skills for agent in timed.agents], say)
+    for j in after_itself([target.after for target in timed.targets]):
+        raise fail(f"targets[{j}].after", "it would come before itself: a circle of targets that "
+                   "wait for each other")
+    _check_windows(timed, fail)
+    return timed
+
+
+def check_target(target: Any, count: int, index: int, fail: Any) -> None:
+    """What one target, of a scenario or a mission, says of time. Raises `fail(key, problem)`."""
+    _finite(target.at, lambda p: fail("at", p))
+    if not (math.isfinite(target.service) and target.service >= 0):
+        raise fail("service", f"{target.service:g} is not allowed; seconds, at least 0")
+    if not (math.isfinite(target.appears) and target.appears >= 0):
+        raise fail("appears", f"{target.appears:g} is not allowed; seconds, at least 0")
+    if target.lapses is not None and not target.lapses >= target.appears:
+        raise fail("lapses", f"{target.lapses:g} is not allowed; at least `appears`, "
+                   f"{target.appears:g}: it would lapse before it appears")
+    for before in target.after:
+        if not 0 <= before < count or before == index:
+            raise fail("after", f"{before} is not allowed; another target's number, "
+                       f"0 to {count - 1}")
+
+
+def check_coalition(target: Any, team: Iterable[tuple[str, ...]], fail: Any) -> None:
+    """Raises `fail(key, problem)` for a coalition that the team can never form."""
+    team = list(team)
+    if target.coalition and target.skills:
+        raise fail("coalition", "give skills or coalition, not both")
+    if not target.coalition and (not target.skills or "" in target.skills):
+        raise fail("skills", "at least one non-empty skill name is needed, or a coalition")
+    have = {skill: sum(skill in its for its in team)
+            for skill in {*target.skills, *target.coalition}}
+    for skill, number in target.coalition.items():
+        if number < 1:
+            raise fail(f"coalition.{skill}", f"{number} is not allowed; at least 1")
+        if have[skill] < number:
+            raise fail(f"coalition.{skill}", f"{number} agents with it are needed; the team has "
+                       f"{have[skill]}")
+    lacking = [skill for skill in target.skills if not have[skill]]
+    if lacking and (target.type == "AND" or len(lacking) == len(set(target.skills))):
+        raise fail("skills", f"no agent has {', '.join(sorted(lacking))}; the team has "
+                   + ", ".join(sorted({skill for its in team for skill in its})))
+
+
+def after_itself(after: list[tuple[int, ...]]) -> list[int]:
+    """Targets on a circle of `after`, in order; empty where there is none."""
+    left = set(range(len(after)))
+    while True:
+        free = [j for j in left if not left & set(after[j])]
+        if not free:
+            return sorted(left)
+        left -= set(free)
+
+
+def distance(a: Place, b: Place, metric: Metric) -> float:
+    """Metres between two places."""
+    x, y = a[0] - b[0], a[1] - b[1]
+    return abs(x) + abs(y) if metric == "manhattan" else math.hypot(x, y)
+
+
+def load(path: str | os.PathLike[str]) -> Timed:
+    """One problem from a JSON file. Raises InputError."""
+    return convert(files.read_json(path), path)
+
+
+def convert(value: Any, source: object, where: str = "") -> Timed:
+    """What was read, checked. Raises InputError."""
+    return check(files.convert(value, Timed, source, where), source, where)
+
+
+def _check_agent(agent: Agent, fail: Any) -> None:
+    _finite(agent.at, lambda p: fail("at", p))
+    if agent.home is not None:
+        _finite(agent.home, lambda p: fail("home", p))
+    _positive(agent.speed, lambda p: fail("speed", p))
+    if "" in agent.skills:
+        raise fail("skills", "a skill name is empty")
+
+
+def _check_windows(timed: Timed, fail: Any) -> None:
+    """Raises for a window that is over before anybody who is needed can be there."""
+    for j, target in enumerate(timed.targets):
+        closes = target.lapses
+        if timed.max_seconds is not None:
+            last = timed.max_seconds - target.service
+            closes = last if closes is None else min(closes, last)
+        if closes is None:
+            continue
+        soonest = _soonest(timed, target)
+        if soonest > closes + 1e-9:
+            key = "lapses" if target.lapses is not None and closes == target.lapses else "at"
+            raise fail(f"targets[{j}].{key}", f"{closes:g} s is over before it can be reached: its "
+                       f"coalition can be there at {soonest:.3f} s at the soonest")
+
+
+def _soonest(timed: Timed, target: Target) -> float:
+    """s at which a coalition can be at the target if everybody goes straight there."""
+    arrivals = {skill: sorted(distance(a.at, target.at, timed.metric) / a.speed
+                              for a in timed.agents if skill in a.skills)
+                for skill in target.needs()}
+    times = [found[number - 1] for skill, number in target.needs().items()
+             if len(found := arrivals[skill]) >= number]
+    either = not target.coalition and target.type == "OR"
+    return max(target.appears, min(times) if either else max(times))
+
+
+def _finite(place: Place, fail: Any) -> None:
+    if not all(math.isfinite(x) for x in place):
+        raise fail(f"{list(place)} is not allowed; two finite numbers")
+
+
+def _positive(value: float, fail: Any) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise fail(f"{value:g} is not allowed; above 0")
