@@ -122,7 +122,7 @@ def check(timed: Timed, source: object, where: str = "") -> Timed:
     for i, agent in enumerate(timed.agents):
         _check_agent(agent, lambda key, problem, i=i: fail(f"agents[{i}].{key}", problem))
     for j, target in enumerate(timed.targets):
-        say = lambda key, problem, j=j: fail(f"targets[{j}].{key}", problem)  # noqa: E731
+        say = lambda key, problem, j=j: fail(f"targets[{j}].{key}", problem)
         check_target(target, len(timed.targets), j, say)
         check_coalition(target, [agent.skills for agent in timed.agents], say)
     for j in after_itself([target.after for target in timed.targets]):

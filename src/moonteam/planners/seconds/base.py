@@ -7,6 +7,7 @@ that get everywhere in the same time), S skills.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -209,6 +210,6 @@ def effort(now: Moment, services: tuple[Service, ...]) -> float:
         way = int(now.home_now[a]) if not mine else int(
             now.start[a, mine[0].target] + now.home[a, mine[-1].target])
         way += sum(int(now.between[now.classes[a], one.target, two.target])
-                   for one, two in zip(mine, mine[1:], strict=False))
+                   for one, two in itertools.pairwise(mine))
         total += float(now.effort[a]) * way
     return total
