@@ -19,7 +19,7 @@ from sim2grid.frame import Frame
 from sim2grid.loop.replan import with_target
 from sim2grid.loop.rules import Rules
 
-Mode = Literal["barrier", "async"]
+Mode = Literal["barrier", "async", "clock"]
 NOBODY = 1 << 30
 """Bit of a skill that no robot has."""
 
@@ -32,6 +32,8 @@ class Body:
     speed: float  # m/s, the speed it travels at
     flies: bool = False
     fall_tilt: float = float(np.radians(60.0))  # rad, it has fallen when tilted further for long
+    footprint: float = 0.3  # m, radius
+    lands: bool = False  # it comes down for a service
 
 
 class Route(NamedTuple):

@@ -85,5 +85,6 @@ def prepare(mission: Mission, source: object) -> Prepared:
 
 def bodies_of(scene: Scene) -> tuple[Body, ...]:
     """The robots of a scene as the executor needs to know them."""
-    return tuple(Body(robot.qpos.start, robot.kind.speed, robot.kind.flies, robot.kind.fall_tilt)
+    return tuple(Body(robot.qpos.start, robot.kind.speed, robot.kind.flies, robot.kind.fall_tilt,
+                      robot.kind.footprint)
                  for robot in scene.robots)

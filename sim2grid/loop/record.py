@@ -20,8 +20,9 @@ from sim2grid.loop import rules
 Ending = Literal["arrived", "timeout", "lost", "cut"]
 LossCause = Literal["fallen", "stuck", "not_a_number", "off_the_map", "event"]
 ReplanCause = Literal["timeout", "wrong_cell", "robot_lost", "new_target", "slowed", "silent",
-                      "heard_again", "impassable"]
-FailureCause = Literal["max_steps", "unsolvable", "plan_over", "engine", "interrupted"]
+                      "heard_again", "impassable", "behind", "appeared", "lapsed"]
+FailureCause = Literal["max_steps", "max_seconds", "unsolvable", "plan_over", "engine",
+                       "interrupted"]
 
 LOSSES: dict[int, LossCause] = {
     rules.FALLEN: "fallen", rules.STUCK: "stuck", rules.NOT_A_NUMBER: "not_a_number",
@@ -37,7 +38,7 @@ class Leg:
 
     robot: int
     decision: int
-    action: int  # 0..4, as the planner asked
+    action: int  # 0..4, as the planner asked; by the clock 5 on the first piece of a way, else 4
     from_cell: Cell
     goal_cell: Cell  # from_cell where it stays or the way is barred
     start_xy: XY  # where it truly stood
@@ -47,6 +48,7 @@ class Leg:
     end_s: float | None = None
     ended: Ending | None = None
     end_cell: Cell | None = None
+    expected_s: float | None = None  # by the clock, what the way takes at travelling speed
 
     @property
     def moving(self) -> bool:

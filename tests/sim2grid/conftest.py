@@ -142,3 +142,8 @@ def execute():
 @pytest.fixture
 def script():
     return Script
+
+
+@pytest.fixture
+def sliding():
+    return SlidingPoints

@@ -104,10 +104,11 @@ class Slow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Silent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing reaches a robot and nothing is heard of it for so many `decisions`."""
+    """Nothing reaches a robot and nothing is heard of it for so many `decisions`, or `seconds`."""
 
     robot: str
-    decisions: int
+    decisions: int = 0
+    seconds: float = 0.0
 
 
 class Impassable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -118,14 +119,18 @@ class Impassable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Something that happens at decision `at_decision`; one of the other keys says what."""
+    """Something that happens at decision `at_decision`; one of the other keys says what.
 
-    at_decision: int
+    By the clock it happens at second `at_s`.
+    """
+
+    at_decision: int = 0
     lost: str | None = None
     target: Target | None = None
     slow: Slow | None = None
     silent: Silent | None = None
     impassable: Impassable | None = None
+    at_s: float | None = None
 
 
 class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -308,9 +313,7 @@ def _check_names(mission: Mission, source: object) -> None:
 
 
 def _check_event(mission: Mission, event: Event, source: object, key: str) -> None:
-    if event.at_decision < 1:
-        raise InputError(source, f"{event.at_decision} is not allowed; at least 1",
-                         f"{key}.at_decision")
+    _check_when(mission, event, source, key)
     what = [name for name in WHAT if getattr(event, name) is not None]
     if len(what) != 1:
         raise InputError(source, f"give one of {', '.join(WHAT[:-1])} and {WHAT[-1]}", key)
@@ -327,11 +330,30 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
                              f"{key}.factor")
     if event.silent is not None:
         _check_robot(mission, event.silent.robot, source, f"{key}.robot")
-        if event.silent.decisions < 1:
+        if mission.clock == "steps" and event.silent.decisions < 1:
             raise InputError(source, f"{event.silent.decisions} is not allowed; at least 1",
                              f"{key}.decisions")
+        if mission.clock == "seconds" and not event.silent.seconds > 0:
+            raise InputError(source, f"{event.silent.seconds:g} is not allowed; above 0",
+                             f"{key}.seconds")
     if event.impassable is not None:
         _check_cell(mission, event.impassable.at, source, f"{key}.at")
+
+
+def _check_when(mission: Mission, event: Event, source: object, key: str) -> None:
+    """Raises InputError for an event that comes at no time, or by the other clock."""
+    if mission.clock == "seconds":
+        if event.at_decision or event.at_s is None:
+            raise InputError(source, "say when: at_s, in seconds; decisions are counted only where "
+                             "the clock is steps", key)
+        if not event.at_s >= 0:
+            raise InputError(source, f"{event.at_s:g} is not allowed; at least 0", f"{key}.at_s")
+    elif event.at_s is not None:
+        raise InputError(source, "is for missions by the clock; say clock: seconds too, or "
+                         "at_decision", f"{key}.at_s")
+    elif event.at_decision < 1:
+        raise InputError(source, f"{event.at_decision} is not allowed; at least 1",
+                         f"{key}.at_decision")
 
 
 def _check_robot(mission: Mission, name: str, source: object, key: str) -> None:

@@ -1,0 +1,108 @@
+"""What a mission by the clock has in store: its events, and targets that appear and lapse."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from moonteam.problem.mission import Event
+from sim2grid.clock.roads import Floats
+from sim2grid.clock.task import Task
+from sim2grid.loop.asked import Asked
+from sim2grid.loop.known import Known
+from sim2grid.loop.logbook import Logbook
+from sim2grid.loop.record import LossCause, ReplanCause
+
+
+class UnderWay(Protocol):
+    """What happens happens to this: `execution.TimedExecution`."""
+
+    asked: Asked
+    known: Known
+    book: Logbook
+    task: Task
+
+    def ask(self, cause: ReplanCause | None = None) -> None:
+        """A decision is due."""
+        ...
+
+    def lose(self, robot: int, cause: LossCause) -> None:
+        """A robot has left the team."""
+        ...
+
+    def learn(self, robot: int, xy: Floats, told: bool = False) -> None:
+        """Ground about xy [2] is closed to a robot's kind."""
+        ...
+
+    def again(self, robot: int) -> None:
+        """A robot's way is looked for anew."""
+        ...
+
+
+class Happenings:
+    """The events that are still to come, and the moments at which windows open and close."""
+
+    def __init__(self, execution: UnderWay):
+        self._its = execution
+        mission = execution.asked.mission
+        self._left = sorted(mission.events, key=lambda event: event.at_s or 0.0)
+        self._names = [robot.name for robot in mission.robots]
+        self._windows: list[tuple[float, str]] = []
+        for target in mission.targets:
+            self._watch(target.appears, target.lapses)
+        self.silent_until = np.zeros(len(mission.robots))  # [R] mission seconds
+
+    @property
+    def bring_targets(self) -> bool:
+        """Whether a target is still to come."""
+        return any(event.target for event in self._left)
+
+    def apply(self) -> None:
+        """All that is due by now."""
+        now = self._its.book.time
+        heard = (self.silent_until > 0) & (self.silent_until <= now)
+        if heard.any():
+            self.silent_until[heard] = 0.0
+            self._its.ask("heard_again")
+        while self._left and (self._left[0].at_s or 0.0) <= now + 1e-6:
+            self._one(self._left.pop(0))
+        while self._windows and self._windows[0][0] <= now + 1e-6:
+            self._its.ask("appeared" if self._windows.pop(0)[1] == "appears" else "lapsed")
+
+    def _watch(self, appears: float, lapses: float | None) -> None:
+        if appears > 0:
+            self._windows.append((appears, "appears"))
+        if lapses is not None:
+            self._windows.append((lapses + 0.01, "lapses"))
+        self._windows.sort()
+
+    def _one(self, event: Event) -> None:
+        its = self._its
+        if event.lost is not None and its.known.mask[self._names.index(event.lost)]:
+            its.lose(self._names.index(event.lost), "event")
+        if event.target is not None:
+            its.task.add(event.target)
+            its.book.record.targets.append(event.target)
+            its.book.record.target_names.append(its.task.names[-1])
+            known = its.known
+            known.snapshot = its.asked.with_targets(known.snapshot, [event.target])
+            self._watch(event.target.appears, event.target.lapses)
+            its.ask("new_target")
+        if event.slow is not None:
+            robot = self._names.index(event.slow.robot)
+            its.known.speeds[robot] = event.slow.factor * its.asked.bodies[robot].speed
+            its.again(robot)
+            its.ask("slowed")
+        if event.silent is not None:
+            robot = self._names.index(event.silent.robot)
+            self.silent_until[robot] = its.book.time + event.silent.seconds
+            its.ask("silent")
+        if event.impassable is not None:
+            kinds = its.task.kinds
+            if event.impassable.kind in kinds:
+                its.learn(kinds.index(event.impassable.kind),
+                          its.task.place(event.impassable.at), told=True)
+                for i, kind in enumerate(kinds):
+                    if kind == event.impassable.kind:
+                        its.again(i)

@@ -1,0 +1,103 @@
+"""From a planner of whole missions to choices: a plan is kept until another is better by enough.
+
+Robots that have set out may be sent elsewhere at any event, so the plan must not flutter: what is
+left of the old one is timed again from where everybody really is, and a new plan has to beat it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from moonteam.planners.seconds.base import (
+    NEVER,
+    Moment,
+    Service,
+    TimedPlan,
+    TimedPlanner,
+    enough,
+    makespan,
+)
+from sim2grid.clock.errand import HOME, WAIT
+
+MARGIN_MS = 1500
+"""ms that a new plan has to gain: less is noise of where robots happen to be."""
+
+
+class Keeper:
+    """Decides for the whole team at each event; see `moonteam.planners.seconds`."""
+
+    def __init__(self, planner: TimedPlanner, margin_ms: int = MARGIN_MS):
+        self.name = planner.name
+        self.plan: TimedPlan | None = None
+        self._planner, self._margin = planner, margin_ms
+        self._order: list[tuple[int, tuple[int, ...]]] = []
+
+    def reset(self, moment: Moment, seed: int = 0) -> None:
+        """Starts a mission."""
+        del moment, seed
+        self._order, self.plan = [], None
+
+    def act(self, moment: Moment) -> npt.NDArray[np.int64]:
+        """[R] what each robot goes for now: a target's number, HOME or WAIT."""
+        kept = timed_again(moment, self._order)
+        self.plan = self._planner.plan(moment)
+        better = self.plan.status != "infeasible" and (
+            kept is None or makespan(moment, self.plan.services)
+            < makespan(moment, kept) - self._margin)
+        if better:
+            self._order = [(one.target, one.agents) for one in self.plan.services]
+        elif kept is None:
+            self._order = []
+        return choices(moment, self._order)
+
+    def expected(self, moment: Moment) -> tuple[Service, ...] | None:
+        """The plan that is kept, as it would go from this moment."""
+        return timed_again(moment, self._order)
+
+
+def choices(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
+            ) -> npt.NDArray[np.int64]:
+    """[R] each robot's first open target in the order; HOME where it has none left."""
+    found = np.full(len(moment.present), HOME, np.int64)
+    for target, team in reversed(order):
+        if not moment.solved[target]:
+            found[list(team)] = target
+    return np.where(moment.present, found, WAIT)
+
+
+def timed_again(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
+                ) -> tuple[Service, ...] | None:
+    """The services of an order, each as soon as its team can be there; None where that is no plan.
+
+    Targets that are solved are left out; what is open and not in it makes it no plan.
+    """
+    at: dict[int, int] = {}
+    free = moment.free.copy()
+    ends = {int(j): int(moment.ends[j]) for j in np.flatnonzero(moment.solved)}
+    services: list[Service] = []
+    for j, team in order:
+        if moment.solved[j]:
+            continue
+        if not all(moment.present[a] for a in team) or not enough(team, j, moment):
+            return None
+        start = int(moment.appears[j])
+        for k in np.flatnonzero(moment.after[j]).tolist():
+            start = max(start, ends.get(k, NEVER))
+        for a in team:
+            way = (moment.start[a, j] if a not in at
+                   else moment.between[moment.classes[a], at[a], j])
+            start = max(start, int(free[a] + way))
+        if start > moment.lapses[j] or start >= NEVER:
+            return None
+        end = start + int(moment.service[j])
+        services.append(Service(j, team, start, end))
+        ends[j] = end
+        for a in team:
+            at[a], free[a] = j, end
+    if len(ends) < len(moment.solved):
+        return None
+    done = tuple(sorted(services, key=lambda one: (one.start, one.end)))
+    return done if makespan(moment, done) <= moment.limit else None

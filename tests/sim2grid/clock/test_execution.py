@@ -1,0 +1,201 @@
+"""Missions by the clock on sliding points: choices, services, windows, losses, closed ground."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from sim2grid.clock.roads import OpenGround, Straight
+
+ROVER = {"name": "rover", "kind": "wheeled", "skills": ["A"], "start": [0, 0]}
+WALKER = {"name": "walker", "kind": "legged", "skills": ["B"], "start": [0, 6]}
+HOPPER = {"name": "hopper", "kind": "drone", "skills": ["C"], "start": [11, 11]}
+LOOK = 0.2  # s between two looks
+
+
+def test_a_straight_way_takes_its_time(mission, drive):
+    spec = mission([ROVER], [{"at": [3, 4], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)))
+    assert done.record.success
+    assert done.record.solves[0].time_s == pytest.approx(5 / 0.5, abs=2 * LOOK + 0.25 / 0.5)
+    assert [d.actions.tolist() for d in done.record.decisions] == [[0]]
+    leg = done.record.legs[0]
+    assert leg.expected_s == pytest.approx(10)
+    assert leg.ended == "arrived"
+
+
+def test_places_off_the_lattice_are_driven_to(mission, drive):
+    spec = mission([ROVER], [{"at": [3.4, 4.3], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)))
+    goal = done.task.place((3.4, 4.3))
+    assert np.hypot(*(done.known.xy[0] - goal)) <= 0.25
+    assert done.record.solves[0].distance_m[0] <= 0.25
+
+
+def test_a_service_is_stood_through_by_its_whole_coalition(mission, drive):
+    spec = mission([ROVER, HOPPER], [
+        {"at": [6, 6], "coalition": {"A": 1, "C": 1}, "service": 7},
+        {"at": [8, 8], "skills": ["C"], "after": ["T1"]}])
+    done = drive(spec, (0, (0, 1)), (1, (1,)))
+    first, second = done.record.solves
+    there = np.hypot(6, 6) / 0.5
+    assert first.time_s == pytest.approx(there + 7, abs=1.0)
+    assert first.robots == (0, 1)
+    assert second.time_s > first.time_s
+    times, xy = np.concatenate(done.record.times), np.concatenate(done.record.qpos)[:, :2]
+    during = (times > first.time_s - 6.5) & (times < first.time_s)
+    assert np.ptp(xy[during], axis=0).max() < 0.25
+
+
+def test_nothing_starts_before_it_appears(mission, drive):
+    spec = mission([HOPPER], [{"at": [9, 11], "skills": ["C"], "appears": 20, "service": 2}])
+    done = drive(spec, (0, (0,)))
+    assert done.record.solves[0].time_s == pytest.approx(22, abs=2 * LOOK)
+
+
+def test_what_has_lapsed_ends_the_mission(mission, drive):
+    spec = mission([ROVER], [{"at": [9, 9], "skills": ["A"], "lapses": 10}])
+    done = drive(spec, (0, (0,)))
+    assert not done.record.success
+    assert done.record.failure == "unsolvable"
+    assert "T1" in done.record.detail
+
+
+def test_a_mission_ends_when_everybody_is_home(mission, drive):
+    robot = ROVER | {"home": [0, 0]}
+    spec = mission([robot], [{"at": [4, 0], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)))
+    assert done.record.success
+    assert done.record.seconds() == pytest.approx(8 / 0.5, abs=2.0)
+    assert np.hypot(*(done.known.xy[0] - done.task.place((0, 0)))) <= 0.25
+
+
+def test_the_time_of_a_mission_runs_out(mission, drive):
+    spec = mission([ROVER], [{"at": [9, 9], "skills": ["A"]}], max_seconds=5)
+    done = drive(spec, (0, (0,)))
+    assert done.record.failure == "max_seconds"
+    assert done.record.detail == "T1 not solved within 5 s"
+
+
+def test_who_is_left_goes_on_without_a_lost_robot(mission, drive):
+    second = ROVER | {"name": "spare", "start": [11, 0]}
+    spec = mission([ROVER, second], [{"at": [5, 0], "skills": ["A"]}],
+                   events=[{"at_s": 3, "lost": "rover"}])
+
+    done = drive(spec, (0, (0,)), spare=(0, (1,)))
+    assert done.record.success
+    assert done.record.solves[0].robots == (1,)
+    assert [cause for _, cause in done.record.replans] == ["robot_lost"]
+    assert done.record.seconds() == pytest.approx(3 + 6 / 0.5, abs=2.0)
+
+
+def test_a_mission_that_a_loss_makes_unsolvable_ends_at_once(mission, drive):
+    spec = mission([ROVER, WALKER], [{"at": [5, 0], "skills": ["A"]}],
+                   events=[{"at_s": 3, "lost": "rover"}])
+    done = drive(spec, (0, (0,)))
+    assert done.record.failure == "unsolvable"
+    assert done.record.seconds() == pytest.approx(3, abs=2 * LOOK)
+    assert "rover (event)" in done.record.detail
+
+
+def test_events_of_all_sorts_are_noted(mission, drive):
+    spec = mission([ROVER], [{"at": [6, 0], "skills": ["A"]}], events=[
+        {"at_s": 2, "slow": {"robot": "rover", "factor": 0.5}},
+        {"at_s": 4, "silent": {"robot": "rover", "seconds": 3}},
+        {"at_s": 5, "target": {"at": [8, 0], "skills": ["A"]}}])
+    done = drive(spec, (0, (0,)), (1, (0,)))
+    causes = [cause for _, cause in done.record.replans]
+    assert causes == ["slowed", "silent", "new_target", "heard_again"]
+    assert done.record.success
+    assert done.record.target_names == ["T1", "T2"]
+    assert done.record.seconds() == pytest.approx(2 + 7 / 0.25, abs=2.0)
+
+
+def test_a_robot_that_falls_behind_is_an_event(mission, drive):
+    spec = mission([ROVER], [{"at": [6, 0], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)), faults={(0, 2.0): "leisurely"})
+    assert "behind" in [cause for _, cause in done.record.replans]
+    assert done.record.success
+
+
+def test_a_robot_that_never_comes_free_is_lost(mission, drive):
+    spec = mission([ROVER, WALKER | {"skills": ["A"]}], [{"at": [6, 0], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)), faults={(0, 2.0): "still"})
+    assert [loss.cause for loss in done.record.losses] == ["stuck"]
+    assert "timeout" in [cause for _, cause in done.record.replans]
+
+
+@dataclass(frozen=True)
+class Wall(OpenGround):
+    """Ground whose ways turn a corner about x = 0, and that learns."""
+
+    closed: tuple = ()
+
+    def way(self, kind, start, goal):
+        if (start[0] < 0) == (goal[0] < 0):
+            return Straight(np.stack([start, goal]), float(np.linalg.norm(goal - start)) / 0.5)
+        corner = np.array([0.0, 4.0])
+        points = np.stack([start, corner, goal])
+        return Bent(points, np.linalg.norm(np.diff(points, axis=0), axis=1) / self.speeds[kind])
+
+    def matrix(self, kind, starts, goals):
+        return np.array([[self.way(kind, a, b).seconds for b in goals] for a in starts])
+
+    def close(self, kind, xy):
+        return Wall(self.speeds, (*self.closed, (kind, *np.round(xy, 3))))
+
+
+@dataclass(frozen=True)
+class Bent:
+    points: np.ndarray
+    legs: np.ndarray
+
+    @property
+    def seconds(self):
+        return float(self.legs.sum())
+
+
+def test_a_way_round_a_corner_is_followed_piece_by_piece(mission, drive):
+    spec = mission([ROVER], [{"at": [11, 0], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)), roads=Wall({"wheeled": 0.5}))
+    legs = done.record.legs
+    assert [leg.action for leg in legs] == [5, 4]
+    assert [leg.ended for leg in legs] == ["arrived", "arrived"]
+    length = 2 * np.hypot(5.5, 9.5)
+    assert done.record.seconds() == pytest.approx(length / 0.5, rel=0.04)
+
+
+def test_ground_that_stops_a_robot_is_learned(mission, drive):
+    spec = mission([ROVER], [{"at": [11, 0], "skills": ["A"]}], max_seconds=120)
+    done = drive(spec, (0, (0,)), roads=Wall({"wheeled": 0.5}), traps=[((-3.0, -1.0), 0.8)])
+    assert "impassable" in [cause for _, cause in done.record.replans]
+    assert [loss.cause for loss in done.record.losses] == ["stuck"]  # these ways never bend
+
+
+def test_two_that_meet_head_on_pass_each_other(mission, drive):
+    other = ROVER | {"name": "other", "start": [10, 0], "skills": ["B"]}
+    spec = mission([ROVER, other], [{"at": [10, 0], "skills": ["A"]}, {"at": [0, 0],
+                                                                      "skills": ["B"]}])
+    done = drive(spec, (0, (0,)), (1, (1,)))
+    assert done.record.success
+    xy = np.concatenate(done.record.qpos)[:, [0, 1, 7, 8]].reshape(-1, 2, 2)
+    assert np.linalg.norm(xy[:, 0] - xy[:, 1], axis=-1).min() > 0.55
+    assert done.record.seconds() < 10 / 0.5 + 5
+
+
+def test_nobody_walks_into_a_robot_that_stands(mission, drive):
+    other = WALKER | {"name": "other", "start": [5, 0]}
+    spec = mission([ROVER, other], [{"at": [10, 0], "skills": ["A"]}])
+    done = drive(spec, (0, (0,)))
+    assert done.record.success
+    xy = np.concatenate(done.record.qpos)[:, [0, 1, 7, 8]].reshape(-1, 2, 2)
+    assert np.linalg.norm(xy[:, 0] - xy[:, 1], axis=-1).min() > 0.55
+
+
+def test_the_same_mission_twice_is_the_same(mission, drive):
+    spec = mission([ROVER, WALKER, HOPPER], [
+        {"at": [6, 6], "skills": ["A", "B"], "type": "AND", "service": 3},
+        {"at": [2, 9], "skills": ["C", "B"], "type": "OR"}])
+    runs = [drive(spec, (0, (0, 1)), (1, (2,))) for _ in range(2)]
+    assert runs[0].record.success
+    assert np.array_equal(*[np.concatenate(one.record.qpos) for one in runs])
