@@ -88,7 +88,7 @@ def test_a_way_goes_through_the_gap_of_a_wall(start, to):
     assert way.seconds == pytest.approx(exact, rel=0.02)
     assert way.seconds >= exact - 1e-9
     assert network.seconds("robot", start, to) == pytest.approx(way.seconds, rel=0.05)
-    assert len(way.points) <= 6
+    assert len(way.points) <= 4
 
 
 def shortest(start, to, corners):

@@ -17,8 +17,11 @@ from numba import njit
 from moonteam.terrain.travel.field import DIAGONAL, REACH, leave
 from moonteam.terrain.travel.lines import at, line_seconds
 
-CORNER = 0.2
+CORNER = 1.0
 """What a way may take longer for each waypoint that it does without, in fastest steps."""
+
+BESIDE = 4.0
+"""Two corners this near each other, in steps, may become one."""
 
 ROUNDS = 60
 """Of moving the corners, at most."""
@@ -43,7 +46,8 @@ def way(slow, field, x, y, to_x, to_y):
         return chain, np.empty(0)
     fastest = slow.min()
     points = _quickest(slow, chain, CORNER * fastest)
-    points = _quickest(slow, _taut(slow, points), CORNER * fastest)
+    points = _taut(slow, _merged(slow, _taut(slow, points), CORNER * fastest))
+    points = _quickest(slow, points, CORNER * fastest)
     legs = np.empty(len(points) - 1)
     for i in range(len(legs)):
         legs[i] = line_seconds(slow, points[i, 0], points[i, 1], points[i + 1, 0],
@@ -127,6 +131,32 @@ def _taut(slow, points):
                         best, points[i, 0], points[i, 1], moved = time, x + dx, y + dy, True
         if not moved:
             break
+    return points
+
+
+@njit(cache=True, nogil=True)
+def _merged(slow, points, corner):
+    """The way with one corner for two beside each other, where it takes at most `corner` s more."""
+    points = points.copy()
+    i = 1
+    while i < len(points) - 2:
+        a, b = points[i], points[i + 1]
+        if math.hypot(a[0] - b[0], a[1] - b[1]) > BESIDE:
+            i += 1
+            continue
+        best = _over(slow, points, i, a[0], a[1]) + corner + line_seconds(
+            slow, b[0], b[1], points[i + 2, 0], points[i + 2, 1])
+        fewer = np.concatenate((points[:i + 1], points[i + 2:]))
+        found = False
+        for y in range(int(min(a[1], b[1])) - 1, int(max(a[1], b[1])) + 2):
+            for x in range(int(min(a[0], b[0])) - 1, int(max(a[0], b[0])) + 2):
+                time = _over(slow, fewer, i, float(x), float(y))
+                if time < best:
+                    best, fewer[i, 0], fewer[i, 1], found = time, float(x), float(y), True
+        if found:
+            points = fewer
+        else:
+            i += 1
     return points
 
 
