@@ -71,7 +71,7 @@ def travel_times(
 
 def passable(site: Site, xy: npt.NDArray[np.floating], limits: Limits) -> BoolMap:
     """Whether a robot with these limits can stand at points xy [..., 2] m: bool [...]."""
-    return _judge(site, xy, limits, *ground_under(site, xy, limits.footprint))
+    return judge(site, xy, limits, *ground_under(site, xy, limits.footprint))
 
 
 def ground_under(site: Site, xy: npt.NDArray[np.floating], radius: float
@@ -110,8 +110,9 @@ def _cross_points(size: tuple[int, int], cell_m: float) -> npt.NDArray[np.float6
     return centres[:, :, None, :] + cross[None, None, :, :]
 
 
-def _judge(site: Site, xy: npt.NDArray[np.floating], limits: Limits, slope: FloatMap,
-           step: FloatMap) -> BoolMap:
+def judge(site: Site, xy: npt.NDArray[np.floating], limits: Limits, slope: FloatMap,
+          step: FloatMap) -> BoolMap:
+    """`passable` [...] at points xy [..., 2] m whose `slope` and `step` are known."""
     able = np.all(np.abs(xy) <= np.asarray(site.extent) - limits.footprint, axis=-1)
     if not limits.flies:
         able &= (slope <= limits.max_slope) & (step <= limits.max_step)
@@ -123,7 +124,7 @@ def _cell_seconds(site: Site, points: npt.NDArray[np.float64], cell_m: float, li
                   ) -> FloatMap:
     """Seconds [H, W] from one border to the other; turning and stopping are not in it."""
     slope, step = ground_under(site, points, limits.footprint)
-    able = _judge(site, points, limits, slope, step).all(axis=-1)
+    able = judge(site, points, limits, slope, step).all(axis=-1)
     slope = slope.mean(axis=-1)
     slowing = limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
     return np.where(able, cell_m / (limits.speed * (1 - slowing)), np.inf)

@@ -1,0 +1,218 @@
+"""Travel in seconds: how long each kind of robot needs between any two places, and its way.
+
+`Roads` answers planners (matrices), the executor (waypoints), maps (fields) and reports
+(expected times) from the same fields, one for each kind and target, made when first asked for.
+Positions are metres, x east, y north, the site's centre at the origin.
+
+Legend: P points, F points from, T points to, H, W rows and columns of the raster.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from moonteam.errors import InputError
+from moonteam.problem.mission import Mission
+from moonteam.terrain.site import Site
+from moonteam.terrain.travel.field import REACH, look_ups, renew, solve
+from moonteam.terrain.travel.lines import at
+from moonteam.terrain.travel.raster import Raster, slowness
+from moonteam.terrain.travel.ways import way
+from moonteam.terrain.traversability import BoolMap, FloatMap, Limits
+
+Place = tuple[float, float]
+Floats = npt.NDArray[np.float64]
+Points = npt.NDArray[Any] | Sequence[Any]  # one [2] or several [P, 2], m
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way at any angle: straight legs from point to point."""
+
+    points: Floats  # [P, 2] m, where it starts first, the target last
+    legs: Floats  # [P - 1] s each leg takes
+
+    @property
+    def seconds(self) -> float:
+        """How long all of it takes; turning and stopping are not in it."""
+        return float(self.legs.sum())
+
+    @property
+    def metres(self) -> float:
+        """How long it is, seen from above."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+    def arrivals(self, leaving: float = 0.0) -> Floats:
+        """When each point is expected to be reached [P] s, if the first is left at `leaving`."""
+        return leaving + np.concatenate([[0.0], np.cumsum(self.legs)])
+
+
+@dataclass(frozen=True)
+class Ground:
+    """One kind's ground, and the fields known over it. `slow` is s a step, as `field` has it."""
+
+    slow: Floats  # [H + 2, W + 2] s a step, within a border of infinity
+    plain: bool  # everywhere open and alike: ways are straight
+    fields: dict[Place, Floats] = field(default_factory=dict)  # [H + 2, W + 2] s, by target
+    known: dict[Place, tuple[Floats, float]] = field(default_factory=dict)
+    """Fields from before ground was closed, and up to how many s they still stand."""
+
+    def field(self, to: Place) -> Floats:
+        """[H + 2, W + 2] s from everywhere to the target at `to` steps."""
+        if to not in self.fields:
+            self.fields[to] = self._solved(to)
+        return self.fields[to]
+
+    def _solved(self, to: Place) -> Floats:
+        if self.plain:
+            rows, columns = (np.arange(-1.0, n - 1.0) for n in self.slow.shape)
+            return self.slow * np.hypot(columns[None, :] - to[0], rows[:, None] - to[1])
+        if to in self.known:
+            return renew(self.slow, *self.known.pop(to))
+        return solve(self.slow, *to)
+
+    def closed(self, shut: BoolMap) -> Ground:
+        """The ground with points [H, W] that are shut; fields that this changes are dropped."""
+        inner = np.pad(shut, 1) & np.isfinite(self.slow)
+        if not inner.any():
+            return self
+        fresh = Ground(np.where(inner, np.inf, self.slow), False)
+        slowest = float(self.slow[np.isfinite(self.slow)].max())
+        for to, (seconds, until) in (self.known | {
+                to: (its, math.inf) for to, its in self.fields.items()}).items():
+            soonest = min(float(seconds[inner].min()) - 3.0 * slowest, until)
+            if soonest == math.inf:
+                fresh.fields[to] = seconds
+            elif soonest > REACH * slowest:
+                fresh.known[to] = seconds, soonest
+        return fresh
+
+
+@dataclass(frozen=True)
+class Roads:
+    """Seconds and ways of each kind over the map of a mission. Made by its class methods."""
+
+    raster: Raster
+    grounds: Mapping[str, Ground]
+
+    @classmethod
+    def over(cls, site: Site, size: tuple[int, int], cell_m: float,
+             limits: Mapping[str, Limits]) -> Roads:
+        """Over a map of `size` (W, H) cells about the site's centre, for kinds by their name."""
+        raster = Raster(size, cell_m)
+        return cls.of_slowness(raster, {kind: slowness(site, raster, its)
+                                        for kind, its in limits.items()})
+
+    @classmethod
+    def of_slowness(cls, raster: Raster, slow: Mapping[str, FloatMap]) -> Roads:
+        """Where seconds per metre [H, W] are known for each kind; infinite: closed."""
+        return cls(raster, {kind: _ground(its * raster.step) for kind, its in slow.items()})
+
+    @classmethod
+    def of_mission(cls, site: Site, mission: Mission, limits: Mapping[str, Limits]) -> Roads:
+        """Over the mission's map."""
+        return cls.over(site, mission.map.size, mission.map.cell_m, limits)
+
+    def passable(self, kind: str, xy: Points) -> bool:
+        """Whether a robot of the kind may be sent to xy [2] m."""
+        place = self._steps([xy])[0]
+        return bool(at(self._ground(kind).slow, *place) < np.inf)
+
+    def seconds(self, kind: str, start: Points, to: Points) -> float:
+        """Seconds from start [2] m to [2] m; infinite where there is no way."""
+        return float(self.matrix(kind, [start], [to])[0, 0])
+
+    def matrix(self, kind: str, starts: Points, to: Points) -> Floats:
+        """Seconds [F, T] from each of starts [F, 2] m to each of `to` [T, 2] m."""
+        ground, begin, ends = self._ground(kind), self._steps(starts), self._steps(to)
+        columns = [look_ups(ground.slow, ground.field(_key(end)), end, begin) for end in ends]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(begin), 0))
+
+    def field(self, kind: str, to: Points) -> FloatMap:
+        """Seconds [H, W] from every point of the raster to `to` [2] m; infinite: no way."""
+        return self._ground(kind).field(_key(self._steps([to])[0]))[1:-1, 1:-1]
+
+    def slowness(self, kind: str) -> FloatMap:
+        """Seconds per metre [H, W] at every point of the raster; infinite where it is closed."""
+        return self._ground(kind).slow[1:-1, 1:-1] / self.raster.step
+
+    def way(self, kind: str, start: Points, to: Points) -> Way:
+        """The way from start [2] m to `to` [2] m. Raises InputError if there is none."""
+        ground, begin = self._ground(kind), self._steps([start])[0]
+        end = self._steps([to])[0]
+        points, legs = way(ground.slow, ground.field(_key(end)), *begin, *end)
+        if len(points) == 0:
+            raise InputError("way", f"there is no way for a {kind} robot from "
+                             f"{_written(start)} to {_written(to)} over this ground")
+        points = (points - self._middle) * self.raster.step
+        points[0], points[-1] = start, to
+        return Way(points, legs)
+
+    def close(self, kind: str, xy: Points, half: float | None = None) -> Roads:
+        """The roads once it is known that the kind cannot cross the square about xy [2] m.
+
+        `half` is half its side, m: half a cell if not given. As about all closed ground, what is
+        nearer than robots stray is closed too. Only fields that this changes are made again, from
+        where it changes them, when they are asked for.
+        """
+        self._steps([xy])
+        reach = (self.raster.cell_m / 2 if half is None else half) + self.raster.stray
+        shut = self.raster.within(xy, (reach, reach))
+        return replace(self, grounds={**self.grounds,
+                                      kind: self._ground(kind).closed(shut)})
+
+    def close_cell(self, kind: str, cell: tuple[int, int]) -> Roads:
+        """`close` for a cell (x, y) of the map, origin lower left."""
+        return self.close(kind, self.centre(cell))
+
+    def centre(self, cell: tuple[int, int]) -> Place:
+        """The centre (x, y) m of a cell (x, y) of the map."""
+        x, y = ((c + 0.5 - n / 2) * self.raster.cell_m
+                for c, n in zip(cell, self.raster.size, strict=True))
+        return x, y
+
+    @property
+    def _middle(self) -> Floats:
+        rows, columns = self.raster.shape
+        return np.array([(columns - 1) / 2, (rows - 1) / 2])
+
+    def _ground(self, kind: str) -> Ground:
+        if kind not in self.grounds:
+            raise InputError("kind", f"no roads for {kind!r}; there are for "
+                             + ", ".join(self.grounds))
+        return self.grounds[kind]
+
+    def _steps(self, xy: Points) -> Floats:
+        """Points [P, 2] m in steps from the raster's first. Raises InputError off the map.
+
+        Half a cell off is still taken for its border, as elsewhere: robots stray.
+        """
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        half = np.array(self.raster.half)
+        off = ~(np.abs(points) <= half + self.raster.cell_m / 2 + 1e-9).all(axis=1)
+        if off.any():
+            raise InputError("point", f"{_written(points[off][0])} m is off the map, which reaches "
+                             f"{half[0]:g} m east and west, {half[1]:g} m north and south of its "
+                             "centre")
+        return np.clip(points, -half, half) / self.raster.step + self._middle
+
+
+def _ground(slow: FloatMap) -> Ground:
+    return Ground(np.pad(slow, 1, constant_values=np.inf), bool(slow.min() == slow.max() < np.inf))
+
+
+def _key(steps: Floats) -> Place:
+    return round(float(steps[0]), 6), round(float(steps[1]), 6)
+
+
+def _written(xy: npt.ArrayLike) -> str:
+    x, y = np.asarray(xy, np.float64)
+    return f"({x:g}, {y:g})"
+
+
