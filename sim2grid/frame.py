@@ -62,6 +62,12 @@ class Frame:
         at = self.continuous(xy)
         return ((at < -margin) | (at > self._size(xp, xy) + margin)).any(-1)
 
+    def on_map(self, xy: Any) -> Any:
+        """Points [..., 2] m, those off the map moved to its border."""
+        xp = xy.__array_namespace__()
+        half = self._size(xp, xy) * (self.cell_m / 2)
+        return xp.clip(xy, -half, half)
+
 
 def tilt(quat: Any) -> Any:
     """Angle [...] rad between a body's z axis and up, from quaternions [..., 4] wxyz."""

@@ -128,7 +128,8 @@ class TimedExecution:
         points, holds = steer.mind(
             xy, aims, places, going, self.asked.grounded,
             np.array([body.footprint for body in self.asked.bodies]),
-            lambda i, p: bool(self.roads.passable(self.task.kinds[i], p)))
+            lambda i, p: not bool(self.asked.frame.off_map(p, 0.0)) and self.roads.passable(
+                self.task.kinds[i], p))
         near = law.near(self.asked.rules, self.asked.frame, xy, places)
         speeds = np.where(holds | (near & ~going), 0.0, known.speeds)
         for i, errand in enumerate(self.errands):
@@ -249,13 +250,14 @@ class TimedExecution:
 
     def _send(self, robot: int, choice: int, place: Floats) -> None:
         known, book, kind = self.known, self.book, self.task.kinds[robot]
-        way = self.roads.way(kind, known.xy[robot], place)
         pace = self.asked.bodies[robot].speed / float(known.speeds[robot])
-        if not np.isfinite(way.seconds):
-            self.errands[robot] = Errand.idle(known.xy[robot], book.time)
-            return
+        here = self.asked.frame.on_map(known.xy[robot])
         book.close(robot, "cut")
         self._note_end(robot)
+        if not np.isfinite(self.roads.matrix(kind, here[None], place[None])[0, 0]):
+            self.errands[robot] = Errand.idle(known.xy[robot], book.time)
+            return
+        way = self.roads.way(kind, here, place)
         self.errands[robot] = Errand.to(choice, place, way, pace, book.time)
         self._open_leg(robot, first=True)
 

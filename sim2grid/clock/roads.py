@@ -37,16 +37,16 @@ class Way(Protocol):
 class Roads(Protocol):
     """Travel of every kind over one piece of ground, closed ground that was learned included."""
 
-    def matrix(self, kind: str, starts: Floats, goals: Floats) -> Floats:
-        """Seconds [S, G] from starts [S, 2] m to goals [G, 2] m; infinite where no way is."""
+    def matrix(self, kind: str, starts: Floats, to: Floats) -> Floats:
+        """Seconds [S, G] from starts [S, 2] m `to` goals [G, 2] m; infinite where no way is."""
         ...
 
-    def way(self, kind: str, start: Floats, goal: Floats) -> Way:
-        """From a start [2] m to a goal [2] m."""
+    def way(self, kind: str, start: Floats, to: Floats) -> Way:
+        """From a start [2] m `to` a goal [2] m. Raises InputError if there is no way."""
         ...
 
-    def passable(self, kind: str, xy: Floats) -> npt.NDArray[np.bool_]:
-        """Whether the kind can be at points [..., 2] m."""
+    def passable(self, kind: str, xy: Floats) -> bool:
+        """Whether the kind can be sent to a point [2] m."""
         ...
 
     def close(self, kind: str, xy: Floats) -> Roads:
@@ -73,19 +73,18 @@ class OpenGround:
 
     speeds: Mapping[str, float]
 
-    def matrix(self, kind: str, starts: Floats, goals: Floats) -> Floats:
+    def matrix(self, kind: str, starts: Floats, to: Floats) -> Floats:
         """See `Roads`."""
-        return np.linalg.norm(starts[:, None] - goals[None], axis=-1) / self.speeds[kind]
+        return np.linalg.norm(starts[:, None] - to[None], axis=-1) / self.speeds[kind]
 
-    def way(self, kind: str, start: Floats, goal: Floats) -> Straight:
+    def way(self, kind: str, start: Floats, to: Floats) -> Straight:
         """See `Roads`."""
-        return Straight(np.stack([start, goal]),
-                        float(np.linalg.norm(goal - start)) / self.speeds[kind])
+        return Straight(np.stack([start, to]),
+                        float(np.linalg.norm(to - start)) / self.speeds[kind])
 
-    def passable(self, kind: str, xy: Floats) -> npt.NDArray[np.bool_]:
+    def passable(self, kind: str, xy: Floats) -> bool:
         """See `Roads`."""
-        del kind
-        return np.ones(xy.shape[:-1], bool)
+        return kind in self.speeds and bool(np.isfinite(xy).all())
 
     def close(self, kind: str, xy: Floats) -> OpenGround:
         """Nothing can be closed."""

@@ -75,7 +75,7 @@ class Task:
         robots, count = len(xy), len(self.targets)
         pace = np.array([body.speed for body in self.bodies]) / speeds
         points = self.points
-        at, free = xy.copy(), np.zeros(robots, np.int64)
+        at, free = self.frame.on_map(xy), np.zeros(robots, np.int64)
         under_way, ends = solved.copy(), np.zeros(count, np.int64)
         for i, errand in enumerate(errands):
             if errand.phase == "serving" and present[i]:

@@ -131,15 +131,15 @@ class Wall(OpenGround):
 
     closed: tuple = ()
 
-    def way(self, kind, start, goal):
-        if (start[0] < 0) == (goal[0] < 0):
-            return Straight(np.stack([start, goal]), float(np.linalg.norm(goal - start)) / 0.5)
+    def way(self, kind, start, to):
+        if (start[0] < 0) == (to[0] < 0):
+            return Straight(np.stack([start, to]), float(np.linalg.norm(to - start)) / 0.5)
         corner = np.array([0.0, 4.0])
-        points = np.stack([start, corner, goal])
+        points = np.stack([start, corner, to])
         return Bent(points, np.linalg.norm(np.diff(points, axis=0), axis=1) / self.speeds[kind])
 
-    def matrix(self, kind, starts, goals):
-        return np.array([[self.way(kind, a, b).seconds for b in goals] for a in starts])
+    def matrix(self, kind, starts, to):
+        return np.array([[self.way(kind, a, b).seconds for b in to] for a in starts])
 
     def close(self, kind, xy):
         return Wall(self.speeds, (*self.closed, (kind, *np.round(xy, 3))))
