@@ -62,7 +62,7 @@ def prepare(mission: Mission, source: object) -> Prepared:
     site = for_mission(mission)
     passable = passable_cells(site, mission, team.limits(kinds))
     for i, robot in enumerate(mission.robots):
-        x, y = robot.start
+        x, y = robot.cell
         if not passable[robot.kind][y, x]:
             raise InputError(source, f"cell {[x, y]} is ground that a {robot.kind} robot cannot "
                              f"cross (slope or boulder) on site {site.name} with seed "
@@ -70,10 +70,12 @@ def prepare(mission: Mission, source: object) -> Prepared:
     scenario = grid_problem(mission, passable)
     for j in unsolvable(Snapshot.start(scenario)):
         raise InputError(source, f"no robots with the skills of {mission.target_name(j)} can "
-                         f"reach its cell {list(mission.targets[j].at)} over this ground; choose "
+                         f"reach its cell {list(mission.targets[j].cell)} over this ground; choose "
                          "another cell or seed", f"targets[{j}].at")
-    starts = waypoints(frame, np.array([r.start for r in mission.robots]),
+    starts = waypoints(frame, np.array([r.cell for r in mission.robots]),
                        np.ones(len(mission.robots), bool))
+    starts = starts + frame.cell_m * np.array(
+        [np.subtract(r.start, r.cell) for r in mission.robots])
     scene = build_scene(site, [
         Placement(robot.name, kinds[robot.kind], (float(x), float(y)))
         for robot, (x, y) in zip(mission.robots, starts, strict=True)])

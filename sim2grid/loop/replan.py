@@ -53,7 +53,7 @@ def with_target(snapshot: Snapshot, target: Target, need: int) -> Snapshot:
     both = target.type == "AND" and len(set(target.skills)) > 1
     return replace(
         snapshot,
-        target_cells=np.concatenate([snapshot.target_cells, np.array([target.at], np.int32)]),
+        target_cells=np.concatenate([snapshot.target_cells, np.array([target.cell], np.int32)]),
         target_skills=np.append(snapshot.target_skills, np.int32(need)),
         target_and=np.append(snapshot.target_and, both),
         solved=np.append(snapshot.solved, False))

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.problem.mission import Mission
+from moonteam.problem.mission import Mission, Place
 from moonteam.problem.scenario import Cell
 from moonteam.robots.base import Height, RobotKind
 from sim2grid.frame import Frame, tilt
@@ -69,7 +69,7 @@ class TargetReport(msgspec.Struct, frozen=True):
     """One target. `distance_m[k]` is how far `robots[k]` stood from the centre when solved."""
 
     name: str
-    at: Cell
+    at: Place  # in cells
     skills: tuple[str, ...]
     type: str
     solved: bool

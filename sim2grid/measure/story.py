@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.problem.mission import Mission
+from moonteam.problem.mission import Mission, Place
 from moonteam.problem.scenario import Cell
 from sim2grid.frame import Frame
 from sim2grid.loop.record import Leg, Record
@@ -104,7 +104,7 @@ class Story:
                     found.append(Replan(time_s, decision, cause, None, None, words))
         return sorted(found, key=lambda replan: replan.time_s)
 
-    def _centre(self, cell: Cell) -> npt.NDArray:
+    def _centre(self, cell: Place) -> npt.NDArray:
         return self.frame.centre(np.array(cell, float))
 
     def _place(self, robot: int, time_s: float) -> npt.NDArray | None:

@@ -290,7 +290,7 @@ def on_grid(fleet: Fleet, make: Callable[[], Planner], events: bool, seeds: Sequ
         spec = mission if events else msgspec.structs.replace(mission, events=())
         executions.append(Execution(spec, fleet.scenarios[k], make(), bodies, fleet.frame,
                                     seed=seeds[k], rules=rules))
-    starts = np.stack([ideal_start(fleet.frame, [r.start for r in mission.robots])
+    starts = np.stack([ideal_start(fleet.frame, [r.cell for r in mission.robots])
                        for mission in fleet.missions])
     run(executions, IdealBackend(rules.chunk_steps), starts)
     return [_ideal(fleet, k, execution, bodies) for k, execution in enumerate(executions)]
@@ -305,7 +305,7 @@ def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) ->
     report = make_report(record, mission, fleet.frame, [body.base for body in bodies],
                          planner=execution.planner.name, objective=None, mode="barrier",
                          backend="grid", seed=execution.asked.seed, grid_plan=plan)
-    starts = [robot.start for robot in mission.robots]
+    starts = [robot.cell for robot in mission.robots]
     return OnGrid(on_the_clock(report, times), plan, route_of(record, starts),
                   round(float(times[-1]), 4))
 

@@ -142,7 +142,7 @@ def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
 
 def placements(mission: Mission, frame: Frame) -> list[Placement]:
     """Where the robots of a mission stand at its start."""
-    starts = waypoints(frame, np.array([r.start for r in mission.robots]),
+    starts = waypoints(frame, np.array([r.cell for r in mission.robots]),
                        np.ones(len(mission.robots), bool))
     return [Placement(robot.name, KINDS.get(robot.kind), (float(x), float(y)))
             for robot, (x, y) in zip(mission.robots, starts, strict=True)]
@@ -174,7 +174,7 @@ def draw_mission(recipe: Recipe, number: int, site: Ground,
 def _allowed(mission: Mission, site: Ground, passable: dict[str, BoolArray]) -> bool:
     """Whether every robot may stand at its start and every target can be solved in time."""
     for robot in mission.robots:
-        x, y = robot.start
+        x, y = robot.cell
         if not passable[robot.kind][y, x]:
             return False
     snapshot = Snapshot.start(grid_problem(mission, passable))
@@ -235,7 +235,7 @@ def _new_targets(count: int, snapshot: Snapshot, mission: Mission,
                  rng: np.random.Generator) -> list[Target]:
     """Targets on free cells that the whole team can solve."""
     team = sorted({skill for robot in mission.robots for skill in robot.skills})
-    taken = {target.at for target in mission.targets}
+    taken = {target.cell for target in mission.targets}
     found: list[Target] = []
     while len(found) < count:
         skills = tuple(skill for skill in team if rng.random() < 0.5)

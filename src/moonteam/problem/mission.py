@@ -5,6 +5,7 @@ Knows neither wing; both read it. Which kinds of robot there are is `moonteam.ro
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Literal
 
@@ -13,11 +14,14 @@ import yaml
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.problem import scenario
+from moonteam.problem import scenario, timed
 from moonteam.problem.scenario import Cell
 
 WHAT = ("lost", "target", "slow", "silent", "impassable")
 """Keys of an event, one of which says what happens."""
+
+Place = tuple[int | float, int | float]
+"""(x, y) in cells, [0, 0] the centre of the cell in the lower left; a cell where both are whole."""
 
 
 class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,22 +39,61 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     seed: int = 0
 
 
-class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One robot of a kind (a registered name, or FILE.py:OBJECT), with skills and start cell."""
+class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One robot of a kind (a registered name, or FILE.py:OBJECT), with skills and start.
+
+    By the clock it may be slower than its kind (`speed`, m/s) and have a `home` to be back at.
+    """
 
     name: str
     kind: str
     skills: tuple[str, ...]
-    start: Cell
+    start: Place
+    speed: float | None = None
+    home: Place | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """The cell of its start."""
+        return cell_of(self.start)
 
 
 class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A cell that needs skills; `type` may be left out where one skill is asked for."""
+    """A place that needs skills; `type` may be left out where one skill is asked for.
 
-    at: Cell
-    skills: tuple[str, ...]
+    By the clock it may say more, as `timed.Target` explains: `service` s, `coalition` by skill
+    and number (in place of skills and type), `after` (names of other targets), `appears` and
+    `lapses` s.
+    """
+
+    at: Place
+    skills: tuple[str, ...] = ()
     type: Literal["AND", "OR"] = "OR"
     name: str | None = None
+    coalition: dict[str, int] = {}
+    service: float = 0.0
+    after: tuple[str, ...] = ()
+    appears: float = 0.0
+    lapses: float | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that it is in."""
+        return cell_of(self.at)
+
+    @property
+    def either(self) -> bool:
+        """Whether one robot with any of its skills will do."""
+        return self.type == "OR" and not self.coalition
+
+    def needs(self) -> dict[str, int]:
+        """Robots needed of each skill; where `either` holds, any one of them."""
+        return self.coalition or dict.fromkeys(self.skills, 1)
+
+
+def cell_of(place: Place) -> Cell:
+    """The cell that a place lies in."""
+    return math.floor(place[0] + 0.5), math.floor(place[1] + 0.5)
 
 
 class Slow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,7 +129,12 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A mission file, checked. Start and target cells are (x, y), origin lower left."""
+    """A mission file, checked. Starts and targets are (x, y) in cells, origin lower left.
+
+    `clock`: in steps a decision is one cell, as the paper has it, and the mission has failed after
+    `max_steps` of them. In seconds a decision is a target, held until something happens, and the
+    mission has failed after `max_seconds`.
+    """
 
     map: Map
     robots: tuple[Robot, ...]
@@ -95,6 +143,8 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     name: str = ""
     max_steps: int = 128
     events: tuple[Event, ...] = ()
+    clock: Literal["steps", "seconds"] = "steps"
+    max_seconds: float = 900.0
 
     def target_name(self, index: int) -> str:
         """The target's own name, else T1, T2, ..."""
@@ -106,8 +156,9 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
             id=self.name,
             size=self.map.size,
             max_steps=self.max_steps,
-            agents=tuple(scenario.Agent(r.start, r.skills, r.kind) for r in self.robots),
-            targets=tuple(scenario.Target(t.at, t.skills, t.type) for t in self.targets),
+            agents=tuple(scenario.Agent(r.cell, r.skills, r.kind) for r in self.robots),
+            targets=tuple(scenario.Target(t.cell, tuple(t.needs()), "OR" if t.either else "AND")
+                          for t in self.targets),
         )
 
 
@@ -148,6 +199,7 @@ def check(mission: Mission, source: object) -> Mission:
     _check_names(mission, source)
     if not mission.robots:
         raise InputError(source, "at least one robot is needed", "robots")
+    _check_clock(mission, source)
     _as_mission_keys(mission, source)
     for j, target in enumerate(mission.targets):
         _check_skills(mission, target, source, f"targets[{j}].skills")
@@ -156,10 +208,65 @@ def check(mission: Mission, source: object) -> Mission:
     return mission
 
 
+def _check_clock(mission: Mission, source: object) -> None:
+    """What is said of time and of places off the lattice. Raises InputError."""
+    if mission.clock == "steps":
+        _check_steps(mission, source)
+        return
+    if not (math.isfinite(mission.max_seconds) and mission.max_seconds > 0):
+        raise InputError(source, f"{mission.max_seconds:g} is not allowed; above 0", "max_seconds")
+    names = [mission.target_name(j) for j in range(len(mission.targets))]
+    team = [robot.skills for robot in mission.robots]
+    for i, robot in enumerate(mission.robots):
+        if robot.speed is not None and not (math.isfinite(robot.speed) and robot.speed > 0):
+            raise InputError(source, f"{robot.speed:g} is not allowed; above 0",
+                             f"robots[{i}].speed")
+        if robot.home is not None:
+            _check_cell(mission, cell_of(robot.home), source, f"robots[{i}].home")
+    after: list[tuple[int, ...]] = []
+    for j, target in enumerate(mission.targets):
+        key = f"targets[{j}]"
+
+        def fail(part: str, problem: str, key: str = key) -> InputError:
+            return InputError(source, problem.replace("agent", "robot"), f"{key}.{part}")
+
+        for name in target.after:
+            if name not in names or name == names[j]:
+                others = ", ".join(other for other in names if other != names[j])
+                raise fail("after", f"{name!r} is not allowed; other targets: {others}")
+        after.append(tuple(names.index(name) for name in target.after))
+        timed.check_times(target, fail)
+        timed.check_coalition(target, team, fail)
+        if target.lapses is None and target.appears + target.service > mission.max_seconds:
+            raise fail("service", f"would end after max_seconds, {mission.max_seconds:g}")
+    for j in timed.after_itself(after):
+        raise InputError(source, "it would come before itself: a circle of targets that wait for "
+                         "each other", f"targets[{j}].after")
+
+
+def _check_steps(mission: Mission, source: object) -> None:
+    """Raises InputError for what means nothing where a decision is one cell."""
+    later = ("coalition", "service", "after", "appears", "lapses")
+    said = [(f"robots[{i}].{key}", getattr(robot, key)) for i, robot in enumerate(mission.robots)
+            for key in ("speed", "home")]
+    said += [(f"targets[{j}].{key}", getattr(target, key))
+             for j, target in enumerate(mission.targets) for key in later]
+    for key, value in said:
+        if value:
+            raise InputError(source, "is for missions by the clock; say clock: seconds too", key)
+    places = [(f"robots[{i}].start", robot.start) for i, robot in enumerate(mission.robots)]
+    places += [(f"targets[{j}].at", target.at) for j, target in enumerate(mission.targets)]
+    for key, place in places:
+        if place != cell_of(place):
+            raise InputError(source, f"{list(place)} is no cell; whole numbers, or clock: seconds "
+                             "too", key)
+
+
 def _check_skills(mission: Mission, target: Target, source: object, key: str) -> None:
     """Raises InputError if the team can never solve the target."""
     alone = msgspec.structs.replace(
-        mission.scenario(), targets=(scenario.Target(target.at, target.skills, target.type),))
+        mission.scenario(), targets=(
+            scenario.Target(target.cell, tuple(target.needs()), "OR" if target.either else "AND"),))
     for skills in scenario.missing_skills(alone).values():
         raise InputError(source, f"no robot has skill {', '.join(skills) or '?'}; the team has "
                          + ", ".join(sorted({s for r in mission.robots for s in r.skills})), key)
@@ -211,7 +318,7 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
     if event.lost is not None:
         _check_robot(mission, event.lost, source, key)
     if event.target is not None:
-        _check_cell(mission, event.target.at, source, f"{key}.at")
+        _check_cell(mission, event.target.cell, source, f"{key}.at")
         _check_skills(mission, event.target, source, f"{key}.skills")
     if event.slow is not None:
         _check_robot(mission, event.slow.robot, source, f"{key}.robot")

@@ -132,9 +132,18 @@ def check(timed: Timed, source: object, where: str = "") -> Timed:
     return timed
 
 
-def check_target(target: Any, count: int, index: int, fail: Any) -> None:
-    """What one target, of a scenario or a mission, says of time. Raises `fail(key, problem)`."""
+def check_target(target: Target, count: int, index: int, fail: Any) -> None:
+    """What one target says of place and time. Raises `fail(key, problem)`."""
     _finite(target.at, lambda p: fail("at", p))
+    check_times(target, fail)
+    for before in target.after:
+        if not 0 <= before < count or before == index:
+            raise fail("after", f"{before} is not allowed; another target's number, "
+                       f"0 to {count - 1}")
+
+
+def check_times(target: Any, fail: Any) -> None:
+    """A target's seconds, be it a scenario's or a mission's. Raises `fail(key, problem)`."""
     if not (math.isfinite(target.service) and target.service >= 0):
         raise fail("service", f"{target.service:g} is not allowed; seconds, at least 0")
     if not (math.isfinite(target.appears) and target.appears >= 0):
@@ -142,10 +151,6 @@ def check_target(target: Any, count: int, index: int, fail: Any) -> None:
     if target.lapses is not None and not target.lapses >= target.appears:
         raise fail("lapses", f"{target.lapses:g} is not allowed; at least `appears`, "
                    f"{target.appears:g}: it would lapse before it appears")
-    for before in target.after:
-        if not 0 <= before < count or before == index:
-            raise fail("after", f"{before} is not allowed; another target's number, "
-                       f"0 to {count - 1}")
 
 
 def check_coalition(target: Any, team: Iterable[tuple[str, ...]], fail: Any) -> None:
