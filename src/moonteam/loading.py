@@ -48,6 +48,22 @@ def load_set(path: Path) -> list[Scenario] | list[Timed]:
     return timed.load_set(path) if path.suffix == ".jsonl" else [timed.load(path)]
 
 
+def load_one(source: str | os.PathLike[str]) -> Mission | Scenario:
+    """A mission or a scenario in steps, be it the only one of a set.
+
+    Raises InputError, for a problem by the clock too.
+    """
+    found = load(source)
+    if isinstance(found, list):
+        if len(found) > 1:
+            raise InputError(source, f"is a set, which holds {len(found)} scenarios; choose one, "
+                             f"such as {os.fspath(source)}:0")
+        found = found[0]
+    if isinstance(found, Timed):
+        raise InputError(source, "is by the clock; only scenarios in steps can be used here")
+    return found
+
+
 def load_mission(name: str) -> Mission:
     """A mission file, or the bundled mission of that name, its kinds of robot found.
 
