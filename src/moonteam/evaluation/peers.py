@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,10 +33,13 @@ NOTES = [
 
 def contenders(problems: Sequence[Timed], planners: Sequence[str], limits: Sequence[float],
                seed: int) -> list[Contender]:
-    """The rows of one set. Raises InputError."""
+    """The rows of one set. Raises InputError for what cannot be."""
     small = max(len(problem.targets) for problem in problems) <= MOST_EXACT
     chosen = planners or (("exact", "lns") if small else ("lns",))
-    return timed.contenders(Options(chosen, time_limits=limits, seed=seed))
+    found = timed.contenders(Options(chosen, time_limits=limits, seed=seed))
+    timed.check(problems, found)
+    return [replace(row, name=row.name.replace("(makespan)", "").replace("makespan, ", ""))
+            for row in found]
 
 
 def run_all(sets: Mapping[str, Sequence[Timed]], rows: Mapping[str, Sequence[Contender]],
@@ -113,19 +117,20 @@ def tables(document: dict) -> list[tuple[list[str], list[list[str]]]]:
     means, against = [], []
     for one in document["sets"]:
         for row in one["planners"]:
-            means.append([one["set"], row["name"], str(row["problems"]), _written(row["makespan"]),
-                          duration(row["seconds"]), str(row["certified"])])
+            means.append([one["set"], row["name"], "ours", str(row["problems"]),
+                          _written(row["makespan"]), duration(row["seconds"]),
+                          str(row["certified"])])
         for row in one["published"]:
-            means.append([one["set"], f"{row['name']} (published)", str(row["problems"]),
+            means.append([one["set"], row["name"], "published", str(row["problems"]),
                           _written(row["makespan"]), "-", "-"])
         for row in one["against"]:
             against.append([
                 one["set"], row["planner"], row["published"], _written(row["difference"], sign="+"),
-                f"{100 * row['share']['mean']:+.1f} %",
+                f"{100 * row['share']['mean']:+.1f}",
                 *(str(row[key]) for key in ("shorter", "equal", "longer"))])
-    return [(["set", "method", "problems", "mean makespan", "planning a problem",
-              "proved optimal"], means),
-            (["set", "ours", "published", "difference", "of theirs", "shorter", "equal", "longer"],
+    return [(["set", "method", "whose", "problems", "mean makespan", "planning", "proved optimal"],
+             means),
+            (["set", "ours", "published", "difference", "in %", "shorter", "equal", "longer"],
              against)]
 
 

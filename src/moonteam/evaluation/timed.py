@@ -119,16 +119,18 @@ def contenders(options: Options) -> list[Contender]:
     return found
 
 
-def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = ""
-            ) -> list[Outcomes]:
-    """What each contender did; after Ctrl-C what was done before it, if that is anything.
-
-    Raises InputError, a planner's own, before anything is run if a problem is too large for it.
-    """
+def check(problems: Sequence[Timed], rows: Sequence[Contender]) -> None:
+    """Raises InputError for a planner that takes on fewer targets than a problem has."""
     largest = max(problems, key=lambda problem: len(problem.targets))
     for row in rows:
         if row.most_targets is not None and len(largest.targets) > row.most_targets:
-            row.planner.plan(base.moment(largest))
+            raise InputError(f"--planner {row.name}", f"takes at most {row.most_targets} targets; "
+                             f"{largest.id or 'a problem'} has {len(largest.targets)}")
+
+
+def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = ""
+            ) -> list[Outcomes]:
+    """What each contender did; after Ctrl-C what was done before it, if that is anything."""
     found: list[Outcomes] = []
     try:
         for row in rows:
@@ -145,7 +147,11 @@ def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = "
 
 def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, title: str,
              command: str) -> dict:
-    """The whole report as a JSON-able document; interrupted, it reports what is done."""
+    """The whole report as a JSON-able document; interrupted, it reports what is done.
+
+    Raises InputError before anything is run.
+    """
+    check(problems, rows)
     found = run_all(problems, rows)
     bootstrap = Bootstrap(len(problems), seed)
     optimal = [best_of(problem) for problem in problems]

@@ -212,15 +212,15 @@ def save_set(path: str | os.PathLike[str], problems: Iterable[Timed]) -> None:
 def by_the_clock(path: str | os.PathLike[str]) -> bool:
     """Whether a `.json` or `.jsonl` file holds problems by the clock, by their key `clock`.
 
-    What is no JSON object counts as none. Raises InputError naming the line if a set holds both.
+    Lines that are no JSON say nothing. Raises InputError naming the line if a set holds both.
     """
     text = files.read_text(path)
     lines = text.splitlines() if os.fspath(path).endswith(".jsonl") else [text]
     first: bool | None = None
     for n, line in enumerate(lines, 1):
-        if not line.strip():
+        clocked = _clocked(line) if line.strip() else None
+        if clocked is None:
             continue
-        clocked = '"clock"' in line and _clocked(line)
         if first is not None and clocked != first:
             kinds = ("in steps", "by the clock")
             raise InputError(path, f"is {kinds[clocked]}, the first {kinds[first]}; a set is one "
@@ -241,11 +241,12 @@ def _decode(line: str, source: object, where: str) -> Any:
         raise InputError(source, f"not JSON: {error}", where) from None
 
 
-def _clocked(line: str) -> bool:
+def _clocked(line: str) -> bool | None:
+    """Whether it is an object with a key `clock`; None if it is no JSON."""
     try:
         value = msgspec.json.decode(line)
     except msgspec.DecodeError:
-        return False
+        return None
     return isinstance(value, dict) and "clock" in value
 
 
