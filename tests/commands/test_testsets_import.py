@@ -54,7 +54,8 @@ def test_a_set_is_written_whole_or_not_at_all(capsys, tmp_path, folder):
 
 @pytest.mark.parametrize(("words", "said"), [
     (["--format", "mrta"], "--format: mrta: no such format of instances"),
-    (["--out", "set.json"], "a set ends in .jsonl"), (["--limit", "0"], "--limit: 0 is not allowed"),
+    (["--out", "set.json"], "a set ends in .jsonl"),
+    (["--limit", "0"], "--limit: 0 is not allowed"),
 ])
 def test_wrong_options(capsys, tmp_path, folder, words, said):
     assert imported(folder, tmp_path / "set.jsonl", *words) == 2
