@@ -18,9 +18,10 @@ import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.loading import load
+from moonteam.loading import load, load_one
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
+from moonteam.problem.timed import Timed
 
 if TYPE_CHECKING:  # JAX and MuJoCo, which take seconds, are loaded when they are needed
     from moonteam.planners.base import Plan, Planner
@@ -87,13 +88,13 @@ def rollout(mission: Named | Mission, planner: str = "policy", *, out: Named | N
     return done.report
 
 
-def evaluate(what: Named | Scenario | Sequence[Scenario],
+def evaluate(what: Named | Scenario | Timed | Sequence[Scenario] | Sequence[Timed],
              planner: str | Sequence[str] = "exact", *, limit: int | None = None,
              **options: Any) -> dict[str, Any]:
     """Planners side by side on scenarios, as `moonteam evaluate grid`.
 
     Args:
-      what: a set, or scenarios.
+      what: a set, or scenarios, in steps or by the clock.
       planner: one planner, or several.
       limit: only the first so many scenarios.
       **options: of the command, one value or several: policy="any_team",
@@ -103,8 +104,6 @@ def evaluate(what: Named | Scenario | Sequence[Scenario],
     Raises InputError, and KeyboardInterrupt when stopped.
     """
     from moonteam import compilation
-    from moonteam.evaluation import grid
-    from moonteam.evaluation.contenders import contenders
     from moonteam.report import command as commands
 
     command = _command("moonteam", "evaluate_grid")
@@ -115,13 +114,13 @@ def evaluate(what: Named | Scenario | Sequence[Scenario],
         **{key: _several(value) if key in many else value for key, value in options.items()}})
     compilation.enable_cache()
     if isinstance(what, (str, os.PathLike)):
-        found = command.load_set(os.fspath(what), limit)
+        found = command.load_any(os.fspath(what), limit)
         title, made_by = Path(what).stem, commands.line("evaluate grid", args)
     else:
-        found = [what] if isinstance(what, Scenario) else list(what)[:limit]
+        found = [what] if isinstance(what, (Scenario, Timed)) else list(what)[:limit]
         title, made_by = "scenarios", "moonteam.evaluate"
-    document = grid.evaluate(found, contenders(command.options_of(args)), args.seed,
-                             f"{title}: {len(found)} scenarios", made_by)
+    document, _ = command.judged(found, command.options_of(args), args.seed,
+                                 f"{title}: {len(found)} scenarios", made_by)
     if "interrupted" in document:
         raise KeyboardInterrupt
     return document
@@ -202,12 +201,5 @@ def _several(value: Any) -> tuple:
 
 
 def _scenario(what: Named | Mission | Scenario) -> Scenario:
-    found = load(what) if isinstance(what, (str, os.PathLike)) else what
-    if isinstance(found, Mission):
-        return found.scenario()
-    if isinstance(found, Scenario):
-        return found
-    if len(found) == 1:
-        return found[0]
-    raise InputError(str(what), f"is a set, which holds {len(found)} scenarios; choose one, such "
-                     f"as {what}:0")
+    found = load_one(what) if isinstance(what, (str, os.PathLike)) else what
+    return found.scenario() if isinstance(found, Mission) else found

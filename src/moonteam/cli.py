@@ -24,6 +24,8 @@ COMMANDS = {
         "moonteam.commands.evaluate_sets", "one policy over all bundled sets, one row a set"),
     "evaluate replanning": (
         "moonteam.commands.evaluate_replanning", "5 + 5 targets, new ones while under way"),
+    "evaluate peers": (
+        "moonteam.commands.evaluate_peers", "our planners beside what others published"),
     "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),
     "evaluate execution": (
         "sim2grid.commands.evaluate_execution",
@@ -48,6 +50,8 @@ COMMANDS = {
     "bench physics": ("moonteam.commands.bench_physics", "physics steps per second"),
     "bench execution": ("sim2grid.commands.bench_execution", "missions in physics per second"),
     "testsets": ("moonteam.commands.testsets", "make the scenario sets, with their optima"),
+    "testsets import": (
+        "moonteam.commands.testsets_import", "others' instances as a set by the clock"),
     "doctor": ("moonteam.commands.doctor", "what this machine can do"),
 }
 

@@ -10,19 +10,22 @@ import msgspec
 from moonteam import paths
 from moonteam.errors import InputError
 from moonteam.problem import mission as missions
-from moonteam.problem import scenario
+from moonteam.problem import scenario, timed
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
+from moonteam.problem.timed import Timed
 
 YAML = (".yaml", ".yml")
 
 
-def load(source: str | os.PathLike[str]) -> Mission | Scenario | list[Scenario]:
+def load(source: str | os.PathLike[str]
+         ) -> Mission | Scenario | Timed | list[Scenario] | list[Timed]:
     """Reads and checks what `source` names.
 
     A mission (.yaml), a scenario (.json), a set (.jsonl), one line of a set (`SET:INDEX`,
-    counted from 0, or `SET:ID`), or the name of a bundled mission or set. A mission without a
-    name gets that of its file. Raises InputError naming file, key and what is allowed.
+    counted from 0, or `SET:ID`), or the name of a bundled mission or set. Scenarios whose objects
+    say `"clock": "seconds"` are problems by the clock, `Timed`. A mission without a name gets
+    that of its file. Raises InputError naming file, key and what is allowed.
     """
     name = os.fspath(source)
     path = Path(name)
@@ -30,12 +33,35 @@ def load(source: str | os.PathLike[str]) -> Mission | Scenario | list[Scenario]:
     if colon and not path.exists() and path.suffix not in YAML:
         return pick(paths.find(head, "testsets", ".jsonl"), which)
     if path.suffix == ".jsonl":
-        return scenario.load_set(path)
+        return load_set(path)
     if path.suffix in YAML or (not path.suffix and not path.exists()):
         if (paths.assets() / "testsets" / f"{name}.jsonl").is_file():
-            return scenario.load_set(paths.find(name, "testsets", ".jsonl"))
+            return load_set(paths.find(name, "testsets", ".jsonl"))
         return load_mission(name)
-    return scenario.load(path)
+    return timed.load(path) if timed.by_the_clock(path) else scenario.load(path)
+
+
+def load_set(path: Path) -> list[Scenario] | list[Timed]:
+    """A set, in steps or by the clock (or one `.json` of either). Raises InputError."""
+    if not timed.by_the_clock(path):
+        return scenario.load_set(path)
+    return timed.load_set(path) if path.suffix == ".jsonl" else [timed.load(path)]
+
+
+def load_one(source: str | os.PathLike[str]) -> Mission | Scenario:
+    """A mission or a scenario in steps, be it the only one of a set.
+
+    Raises InputError, for a problem by the clock too.
+    """
+    found = load(source)
+    if isinstance(found, list):
+        if len(found) > 1:
+            raise InputError(source, f"is a set, which holds {len(found)} scenarios; choose one, "
+                             f"such as {os.fspath(source)}:0")
+        found = found[0]
+    if isinstance(found, Timed):
+        raise InputError(source, "is by the clock; only scenarios in steps can be used here")
+    return found
 
 
 def load_mission(name: str) -> Mission:
@@ -50,9 +76,9 @@ def load_mission(name: str) -> Mission:
     return msgspec.structs.replace(found, name=found.name or path.stem)
 
 
-def pick(path: Path, which: str) -> Scenario:
+def pick(path: Path, which: str) -> Scenario | Timed:
     """Scenario number `which` of a set, or the one with that id. Raises InputError."""
-    found = scenario.load_set(path)
+    found = load_set(path)
     same = [s for s in found if s.id == which]
     if same:
         return same[0]

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from moonteam import compilation, paths
+from moonteam import compilation, loading, paths
 from moonteam.commands.options import Drawn, Limited, Many, Reported
 from moonteam.errors import InputError
-from moonteam.problem import scenario
 from moonteam.problem.scenario import Scenario
+from moonteam.problem.timed import Timed
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,15 @@ class Args(Drawn, Limited, Reported):
     promise. Failures count with T = max_steps and the moves they made. Options marked "again"
     may be given several times.
 
+    Of a set by the clock (its objects say "clock": "seconds"), makespan and effort are in its
+    own unit of time, and planners are those by the clock: exact, greedy, lns, cpsat, exhaustive.
+
     Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png.
 
     Examples:
       moonteam evaluate grid 3x5 --planner exact --planner greedy --limit 200
       moonteam evaluate grid set.jsonl --planner exact --objective makespan --objective moves
+      moonteam evaluate grid peers/mrta-benchmark --planner exact --planner greedy
       moonteam evaluate grid 8x40 --planner lns --time-limit 0.01 --time-limit 0.1 --limit 20
       moonteam evaluate grid --count 500 --targets 3 --side 8 --max-steps 48 --planner policy
       --policy small --decode argmax --decode best-of-16
@@ -43,8 +48,8 @@ class Args(Drawn, Limited, Reported):
     """exact, greedy, lns, exhaustive, cpsat, policy, another package's, or FILE.py:OBJECT;
     again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
-    """makespan, moves or weighted; again for more rows. Default: makespan, and for best-of-K
-    what the preference asks for."""
+    """makespan, moves (by the clock: effort) or weighted; again for more rows. Default: makespan,
+    and for best-of-K what the preference asks for."""
     policy: Many[tuple[str, ...]] = ()
     """Policy file (.safetensors) or the name of a bundled policy; again for more. Default:
     any_team."""
@@ -65,19 +70,30 @@ class Args(Drawn, Limited, Reported):
     more rows. Default: theirs."""
 
 
-def load_set(name: str, limit: int | None) -> list[Scenario]:
-    """The scenarios of a file or bundled set. Raises InputError naming file and line."""
+def load_any(name: str, limit: int | None) -> list[Scenario] | list[Timed]:
+    """The scenarios of a file or bundled set, in steps or by the clock.
+
+    Raises InputError naming file and line.
+    """
     if limit is not None and limit < 1:
         raise InputError("--limit", f"{limit} is not allowed; at least 1")
     suffix = ".json" if name.endswith(".json") else ".jsonl"
-    found = scenario.load_set(paths.find(name, "testsets", suffix))
-    return found[:limit]
+    return loading.load_set(paths.find(name, "testsets", suffix))[:limit]
 
 
-def _scenarios(args: Args) -> tuple[list[Scenario], str]:
+def load_set(name: str, limit: int | None) -> list[Scenario]:
+    """The same, in steps only. Raises InputError for a set by the clock too."""
+    found = load_any(name, limit)
+    steps = [one for one in found if isinstance(one, Scenario)]
+    if not steps:
+        raise InputError(name, "is by the clock; only scenarios in steps can be used here")
+    return steps
+
+
+def _scenarios(args: Args) -> tuple[list[Scenario] | list[Timed], str]:
     """The scenarios and a title."""
     if args.set is not None:
-        found = load_set(args.set, args.limit)
+        found = load_any(args.set, args.limit)
         return found, f"{Path(args.set).stem}: {len(found)} scenarios"
     from moonteam.evaluation.draw import Draw
 
@@ -122,12 +138,21 @@ def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.evaluation import grid
-    from moonteam.evaluation.contenders import contenders
     from moonteam.report import command
 
     found, title = _scenarios(args)
-    rows = contenders(options_of(args))
-    document = grid.evaluate(found, rows, args.seed, title,
-                             command.line("evaluate grid", args))
-    return deliver(args, document, grid, "gaps.png")
+    document, form = judged(found, options_of(args), args.seed, title,
+                            command.line("evaluate grid", args))
+    return deliver(args, document, form, "gaps.png")
+
+
+def judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str,
+           line: str) -> tuple[dict, Any]:
+    """The report on scenarios in steps or by the clock, and the module that says its form."""
+    from moonteam.evaluation import contenders, grid, timed
+
+    clocked = [one for one in found if isinstance(one, Timed)]
+    if clocked:
+        return timed.evaluate(clocked, timed.contenders(options), seed, title, line), timed
+    steps = [one for one in found if isinstance(one, Scenario)]
+    return grid.evaluate(steps, contenders.contenders(options), seed, title, line), grid

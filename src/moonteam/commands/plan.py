@@ -8,7 +8,6 @@ import tyro
 
 from moonteam import files, loading
 from moonteam.commands.options import Planning, Printed, Saved
-from moonteam.errors import InputError
 from moonteam.planners.base import Plan, Snapshot
 from moonteam.problem import scenario
 from moonteam.problem.mission import Mission
@@ -55,16 +54,11 @@ class Case:
 
 def load_case(name: str) -> Case:
     """The scenario that the command line names. Raises InputError."""
-    found = loading.load(name)
+    found = loading.load_one(name)
     if isinstance(found, Mission):
         return Case(found.scenario(), found.name, tuple(r.name for r in found.robots),
                     tuple(found.target_name(j) for j in range(len(found.targets))))
-    if isinstance(found, Scenario):
-        return _named(found)
-    if len(found) > 1:
-        raise InputError(name, f"is a set, which holds {len(found)} scenarios; choose one, such "
-                         f"as {name}:0")
-    return _named(found[0])
+    return _named(found)
 
 
 def _named(found: Scenario) -> Case:

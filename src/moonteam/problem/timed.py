@@ -195,9 +195,59 @@ def load(path: str | os.PathLike[str]) -> Timed:
     return convert(files.read_json(path), path)
 
 
+def load_set(path: str | os.PathLike[str]) -> list[Timed]:
+    """A `.jsonl` set, one problem a line. Raises InputError naming the line."""
+    found = [convert(_decode(line, path, f"line {n}"), path, f"line {n}")
+             for n, line in enumerate(files.read_text(path).splitlines(), 1) if line.strip()]
+    if not found:
+        raise InputError(path, "holds no problem; one JSON object a line is needed")
+    return found
+
+
+def save_set(path: str | os.PathLike[str], problems: Iterable[Timed]) -> None:
+    """Writes a `.jsonl` set, whole or not at all."""
+    files.write_text(path, "".join(files.dump_json(one) + "\n" for one in problems))
+
+
+def by_the_clock(path: str | os.PathLike[str]) -> bool:
+    """Whether a `.json` or `.jsonl` file holds problems by the clock, by their key `clock`.
+
+    Lines that are no JSON say nothing. Raises InputError naming the line if a set holds both.
+    """
+    text = files.read_text(path)
+    lines = text.splitlines() if os.fspath(path).endswith(".jsonl") else [text]
+    first: bool | None = None
+    for n, line in enumerate(lines, 1):
+        clocked = _clocked(line) if line.strip() else None
+        if clocked is None:
+            continue
+        if first is not None and clocked != first:
+            kinds = ("in steps", "by the clock")
+            raise InputError(path, f"is {kinds[clocked]}, the first {kinds[first]}; a set is one "
+                             "or the other", f"line {n}")
+        first = clocked
+    return bool(first)
+
+
 def convert(value: Any, source: object, where: str = "") -> Timed:
     """What was read, checked. Raises InputError."""
     return check(files.convert(value, Timed, source, where), source, where)
+
+
+def _decode(line: str, source: object, where: str) -> Any:
+    try:
+        return msgspec.json.decode(line)
+    except msgspec.DecodeError as error:
+        raise InputError(source, f"not JSON: {error}", where) from None
+
+
+def _clocked(line: str) -> bool | None:
+    """Whether it is an object with a key `clock`; None if it is no JSON."""
+    try:
+        value = msgspec.json.decode(line)
+    except msgspec.DecodeError:
+        return None
+    return isinstance(value, dict) and "clock" in value
 
 
 def _check_agent(agent: Agent, fail: Any) -> None:

@@ -131,15 +131,15 @@ def table_csv(document: dict) -> str:
 
 
 def rows_csv(document: dict) -> str:
-    """One row a scenario and planner as CSV."""
+    """One row a scenario and planner as CSV; the optima, where they are known, at the end."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["id", "planner", "success", "makespan", "moves", "optimal_makespan",
-                     "optimal_moves"])
+    first = document["rows"][0]
+    keys, best = [key for key in first if key != "optimal"], list(first["optimal"])
+    writer.writerow(keys + [f"optimal_{key}" for key in best])
     for row in document["rows"]:
-        best = row["optimal"]
-        writer.writerow([row["id"], row["planner"], int(row["success"]), row["makespan"],
-                         row["moves"], best["makespan"], best["moves"]])
+        values = [row[key] for key in keys] + [row["optimal"][key] for key in best]
+        writer.writerow([int(v) if isinstance(v, bool) else v for v in values])
     return out.getvalue()
 
 

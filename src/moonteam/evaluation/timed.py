@@ -1,0 +1,218 @@
+"""Planners by the clock side by side on a set: what `grid` is to scenarios in steps."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from moonteam.errors import InputError
+from moonteam.evaluation.contenders import MAKESPAN, Options
+from moonteam.planners.base import Objective, check_objective
+from moonteam.planners.seconds import base, registry
+from moonteam.planners.seconds.base import MS, TimedPlanner
+from moonteam.problem.timed import Agent, Target, Timed
+from moonteam.report import provenance, tables
+from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure
+from moonteam.report.progress import track
+from moonteam.report.tables import Column
+
+PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
+          ("success", "success", 1.0))
+COLUMNS = (
+    Column("success", "success", lambda value: f"{value:.3f}"),
+    Column("makespan", "mean makespan", lambda value: f"{value:.3f}"),
+    Column("effort", "mean effort", lambda value: f"{value:.2f}"),
+    Column("makespan_gap", "makespan gap", lambda value: f"{100 * value:+.2f} %"),
+    Column("certified", "proved optimal", lambda value: f"{value:.3f}"),
+    *tables.SECONDS)
+PAGE = COLUMNS
+
+WARM = Timed("seconds", (Agent((0.0, 0.0), ("A",)), Agent((1.0, 0.0), ("B",), 2.0, (0.0, 0.0))), (
+    Target((3.0, 0.0), ("A", "B"), service=1.0), Target((0.0, 3.0), ("A",), after=(0,))))
+"""A problem that takes no time, for what is loaded or compiled at the first call."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One plan, judged: makespan and effort in the set's own unit of time."""
+
+    id: str
+    success: bool
+    makespan: float | None
+    effort: float | None
+    status: str
+    seconds: float
+    wrong: str = ""
+    """What the judge found wrong with it."""
+
+    def row(self, planner: str, optimal: float | None) -> dict:
+        """As the report holds it."""
+        return {"id": self.id, "planner": planner, "success": self.success,
+                "makespan": self.makespan, "effort": self.effort, "seconds": self.seconds,
+                "status": self.status, "optimal": {"makespan": optimal}}
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One row of the table: a planner with an objective and perhaps a time limit."""
+
+    name: str
+    planner: TimedPlanner
+    most_targets: int | None = None
+
+    def plan(self, problem: Timed) -> Result:
+        """One problem, planned and judged; nothing of the planner's promise is believed."""
+        now = base.moment(problem)
+        began = time.perf_counter()
+        plan = self.planner.plan(now)
+        seconds = time.perf_counter() - began
+        wrong = "; ".join(base.problems(now, plan.services)) if plan.status != "infeasible" else ""
+        if wrong or plan.status == "infeasible":
+            return Result(problem.id, False, None, None, plan.status, seconds, wrong)
+        return Result(problem.id, True, base.makespan(now, plan.services) / MS,
+                      base.effort(now, plan.services) / MS, plan.status, seconds)
+
+    def warm(self) -> float:
+        """s of the first call, which loads and compiles."""
+        began = time.perf_counter()
+        self.planner.plan(base.moment(WARM))
+        return time.perf_counter() - began
+
+
+@dataclass
+class Outcomes:
+    """What one contender did on a set, as far as it came."""
+
+    planner: str
+    first_call: float = 0.0
+    results: list[Result] = field(default_factory=list)
+
+
+def contenders(options: Options) -> list[Contender]:
+    """All rows asked for. Raises InputError at the first wrong name or number."""
+    for option, given in (("--policy", options.policies), ("--preference", options.preferences),
+                          ("--decode", options.decodes != ("argmax",)),
+                          ("--alone", options.alone)):
+        if given:
+            raise InputError(option, "has no effect on problems by the clock, which no policy "
+                             "plans yet")
+    given = ["moves" if one == "effort" else one for one in options.objectives]
+    objectives: Sequence[Objective] = [
+        check_objective(one, options.alpha, options.beta) for one in dict.fromkeys(given)
+    ] or MAKESPAN
+    found = []
+    for name in dict.fromkeys(options.planners):
+        kind = registry.find(name)
+        limits = [*dict.fromkeys(options.time_limits)] if kind.anytime else []
+        for objective, limit in itertools.product(objectives, limits or [None]):
+            words = ["effort" if objective == "moves" else objective]
+            words += [f"{limit:g} s"] if len(limits) > 1 else []
+            found.append(Contender(f"{kind.name}({', '.join(words)})", kind.make(
+                options.of(objective, limit)), kind.most_targets))
+    names = [one.name for one in found]
+    if len(set(names)) < len(names):
+        raise InputError("--planner", "two rows would have the same name; rename one")
+    return found
+
+
+def check(problems: Sequence[Timed], rows: Sequence[Contender]) -> None:
+    """Raises InputError for a planner that takes on fewer targets than a problem has."""
+    largest = max(problems, key=lambda problem: len(problem.targets))
+    for row in rows:
+        if row.most_targets is not None and len(largest.targets) > row.most_targets:
+            raise InputError(f"--planner {row.name}", f"takes at most {row.most_targets} targets; "
+                             f"{largest.id or 'a problem'} has {len(largest.targets)}")
+
+
+def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = ""
+            ) -> list[Outcomes]:
+    """What each contender did; after Ctrl-C what was done before it, if that is anything."""
+    found: list[Outcomes] = []
+    try:
+        for row in rows:
+            done = Outcomes(row.name, row.warm())
+            found.append(done)
+            for problem in track(problems, f"{title} {row.name}".strip(), len(problems)):
+                done.results.append(row.plan(problem))
+    except KeyboardInterrupt:
+        found = [done for done in found if done.results]
+        if not found:
+            raise
+    return found
+
+
+def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, title: str,
+             command: str) -> dict:
+    """The whole report as a JSON-able document; interrupted, it reports what is done.
+
+    Raises InputError before anything is run.
+    """
+    check(problems, rows)
+    found = run_all(problems, rows)
+    bootstrap = Bootstrap(len(problems), seed)
+    optimal = [best_of(problem) for problem in problems]
+    known = sum(one is not None for one in optimal)
+    notes = [f"Measured against the optimum of {known} of {len(problems)} problems, which their "
+             "file states." if known else "No optimum is known: no gaps.",
+             "Makespan: when the last service has ended and everybody with a home is there; "
+             "effort: the team's time under way; both in the set's own unit of time.",
+             f"In brackets: 95 % bootstrap intervals over {len(problems)} problems, "
+             f"{RESAMPLES} resamples.", *faults(found)]
+    lacking = [row.name for row in rows if row.name not in whole(found, len(problems))]
+    return {
+        "title": title, "summary": [summary(one, optimal, bootstrap) for one in found],
+        "rows": [result.row(one.planner, best) for one in found
+                 for result, best in zip(one.results, optimal, strict=False)],
+        "notes": notes, "meta": provenance.meta(command, seed),
+    } | ({"interrupted": lacking} if lacking else {})
+
+
+def whole(found: Sequence[Outcomes], count: int) -> list[str]:
+    """Names of those that came to the end of a set."""
+    return [one.planner for one in found if len(one.results) == count]
+
+
+def faults(found: Sequence[Outcomes]) -> list[str]:
+    """One line for each planner whose plans the judge would not have, with the first of them."""
+    lines = []
+    for one in found:
+        wrong = [result for result in one.results if result.wrong]
+        if wrong:
+            lines.append(f"{one.planner}: {len(wrong)} plans break the rules, counted as failures; "
+                         f"{wrong[0].id}: {wrong[0].wrong}")
+    return lines
+
+
+def best_of(problem: Timed) -> float | None:
+    """The makespan that is proved the least, where one is known."""
+    return None if problem.optimal is None else problem.optimal.makespan
+
+
+def summary(done: Outcomes, optimal: Sequence[float | None], bootstrap: Bootstrap) -> dict:
+    """A row of the report. Failures have no makespan and are left out of its mean.
+
+    What an interruption left out is left out everywhere.
+    """
+    def column(values: Sequence[float | None]) -> np.ndarray:
+        padded = [*values, *[None] * (bootstrap.count - len(values))]
+        return np.array([np.nan if value is None else value for value in padded])
+
+    results = done.results
+    makespan = column([r.makespan for r in results])
+    gap = bootstrap.ratio(makespan, column(optimal))
+    found = {
+        "success": bootstrap.mean(column([float(r.success) for r in results])),
+        "makespan": bootstrap.mean(makespan),
+        "effort": bootstrap.mean(column([r.effort for r in results])),
+        "makespan_gap": Figure(*(value - 1.0 for value in gap)),
+        "certified": bootstrap.mean(column([
+            float(r.success and r.status == "optimal") for r in results]))}
+    return {"planner": done.planner, "scenarios": len(results),
+            **{key: figure.value for key, figure in found.items()},
+            "intervals": {key: [figure.low, figure.high] for key, figure in found.items()},
+            "seconds": sum(r.seconds for r in results) / max(len(results), 1),
+            "first_call_seconds": done.first_call}
