@@ -50,8 +50,9 @@ class Args(Planning, Missions, Resumable, Reported):
     """Missions a site."""
     loop: tuple[Literal["closed", "open", "oracle", "grid"], ...] = ("closed",)
     """Which baselines stand in the table."""
-    mode: tuple[Literal["barrier", "async"], ...] = ("barrier",)
-    """barrier: all robots decide together; async: each when it arrives (closed, oracle)."""
+    mode: tuple[Literal["barrier", "async", "clock"], ...] = ("barrier",)
+    """barrier: all robots decide together; async: each when it arrives (closed, oracle); clock: a
+    decision is a target, planned in seconds and driven at any angle (closed, not the policy)."""
     planner: tuple[str, ...] = ("policy",)
     """Who decides: registered planners (policy, exact, greedy, lns, cpsat, exhaustive,
     another package's), or

@@ -14,7 +14,57 @@ import numpy.typing as npt
 
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.trees import where
-from sim2grid.loop.execution import Execution
+from sim2grid.loop.asked import Asked
+
+
+class Decider(Protocol):
+    """Who answers an execution's questions."""
+
+    def act(self, question: Any, /) -> Any:
+        """The answer."""
+        ...
+
+
+class Driven(Protocol):
+    """A mission under way: `execution.Execution`, or `sim2grid.clock`'s."""
+
+    finished: bool
+    question: Any  # None where nothing is asked
+
+    @property
+    def asked(self) -> Asked:
+        """What does not change."""
+        ...
+
+    @property
+    def planner(self) -> Decider:
+        """Who answers."""
+        ...
+
+    def start(self, qpos: npt.ArrayLike) -> None:
+        """Takes the first pose [nq]."""
+        ...
+
+    def commands(self) -> list[tuple[npt.NDArray, float, bool]]:
+        """Waypoint [2] m, speed m/s and lost, for each robot."""
+        ...
+
+    def observe(self, qpos: npt.NDArray, power: npt.NDArray, propellant: npt.NDArray,
+                period: float) -> None:
+        """Takes what happened: qpos [T, nq], power, propellant [T, R]."""
+        ...
+
+    def answer(self, answer: Any, /) -> None:
+        """Takes the answer to its question."""
+        ...
+
+    def diverged(self) -> None:
+        """The engine could not go on."""
+        ...
+
+    def interrupt(self) -> None:
+        """It ends where it stands."""
+        ...
 
 
 class Backend(Protocol):
@@ -32,7 +82,7 @@ class Backend(Protocol):
         ...
 
 
-def run(executions: Sequence[Execution], backend: Backend, qpos: npt.ArrayLike,
+def run(executions: Sequence[Driven], backend: Backend, qpos: npt.ArrayLike,
         progress: Callable[[], None] = lambda: None, *, width: int = 0,
         rows: Sequence[int] = (), finished: Callable[[int], None] = lambda index: None) -> None:
     """Drives executions on the rows of a backend to their ends.
@@ -71,7 +121,7 @@ def run(executions: Sequence[Execution], backend: Backend, qpos: npt.ArrayLike,
 class _Rows:
     """The rows of a backend and the executions that take turns in them."""
 
-    def __init__(self, executions: Sequence[Execution], backend: Backend, poses: npt.NDArray,
+    def __init__(self, executions: Sequence[Driven], backend: Backend, poses: npt.NDArray,
                  queues: list[list[int]]):
         self._executions, self._backend, self._queues = executions, backend, queues
         self._poses, self._rules = poses, executions[0].asked.rules
@@ -103,9 +153,9 @@ class _Rows:
 
     def _answer(self) -> None:
         """Has the planners answer all questions at once."""
-        asking = [self._executions[k] for k in self.busy() if self._executions[k].question]
-        questions = [e.question for e in asking if e.question is not None]
-        answers = [e.planner.act(q) for e, q in zip(asking, questions, strict=True)]
+        busy = [self._executions[k] for k in self.busy()]
+        asking = [execution for execution in busy if execution.question is not None]
+        answers = [e.planner.act(e.question) for e in asking]
         for execution, actions in zip(asking, answers, strict=True):
             execution.answer(actions)
 

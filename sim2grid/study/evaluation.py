@@ -8,6 +8,9 @@ A contender is a loop with a planner and a mode:
   take the plan's next cell when all have arrived or timed out, wherever they are.
 - `grid`: no physics, every robot is at once where it was sent (see `ideal`).
 
+In mode `clock` a decision is a target, and the planner plans in seconds over the ground's slopes
+(see `sim2grid.clock`); the loop is closed, and who decides is a planner by the clock.
+
 Missions keep row and number of rows of the engine however they are run, so that each can be
 repeated alone to the bit. Legend: F missions of a fleet, B rows of the engine.
 """
@@ -17,8 +20,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import msgspec
 import numpy as np
@@ -28,8 +32,14 @@ from moonteam.physics.backends import MjxBackend
 from moonteam.planners import registry
 from moonteam.planners.base import Objective, Planner
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
+from moonteam.planners.seconds import registry as timed_planners
+from moonteam.planners.seconds.base import MS
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
+from moonteam.robots import team
+from moonteam.terrain.travel import Roads
+from sim2grid.clock.execution import TimedExecution
+from sim2grid.clock.keeper import Keeper
 from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
@@ -117,7 +127,7 @@ class Row(msgspec.Struct, frozen=True):
     seed: int  # of the planner
     slot: int  # row of the engine
     solvable: bool  # False where lost robots of the mission's own events left it unsolvable
-    nominal_s: float | None  # mission seconds of the same planner on the grid
+    nominal_s: float | None  # mission s of its planner on the grid; by the clock, as first planned
     report: Report
 
 
@@ -130,13 +140,21 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class OnGrid:
+class Promise:
+    """What a mission would cost if all went as planned."""
+
+    plan: GridPlan | None
+    nominal_s: float | None
+
+
+@dataclass(frozen=True)
+class OnGrid(Promise):
     """What a planner makes of a mission on the grid alone."""
 
-    report: Report
     plan: GridPlan
-    route: Route
     nominal_s: float
+    report: Report
+    route: Route
 
 
 @dataclass
@@ -203,16 +221,26 @@ class Group:
                 self._run(contender, todo)
 
     def _run(self, contender: Contender, todo: list[int]) -> None:
+        if contender.mode == "clock":
+            self._drive(contender, todo, [self._by_the_clock(contender, k) for k in todo],
+                        self._promises(contender))
+            return
         make = maker(contender)
         grid = self._on_grid(contender, make)
         if contender.loop == "grid":
             for k in todo:
-                self._keep(contender, k, grid[k].report, grid[k])
+                self._keep(contender, k, grid[k].report, grid[k].nominal_s)
             return
         routes: list[Route | None] = [None] * len(grid)
         if contender.loop == "open":
             routes = [plan.route for plan in self._on_grid(contender, make, events=False)]
-        executions = [self._execution(contender, make, k, routes[k]) for k in todo]
+        self._drive(contender, todo,
+                    [self._execution(contender, make, k, routes[k]) for k in todo], grid)
+
+    def _drive(self, contender: Contender, todo: list[int],
+               executions: Sequence[Execution | TimedExecution],
+               promised: Sequence[Promise]) -> None:
+        """Runs missions in physics and keeps their rows."""
         done = len(self._fleet.missions) - len(todo)
         total = len(self._fleet.missions)
         title = f"{self._all.label}{self._fleet.site.name}: {contender.name}"
@@ -220,17 +248,19 @@ class Group:
         def finished(index: int) -> None:
             nonlocal done
             k = todo[index]
-            report = self._report(contender, k, executions[index].record, grid[k].plan)
+            report = self._report(contender, k, executions[index].record,
+                                  promised[k].plan)
             executions[index].book.record = Record()  # its poses are not needed any more
-            self._keep(contender, k, report, grid[k])
+            self._keep(contender, k, report, promised[k].nominal_s)
             done += 1
             update(done, f"{done} of {total} missions")
 
         with bar(title, total, done) as update:
             update(done, f"{done} of {total} missions")
             if contender.backend == "fused":
-                whole.run(executions, MjxBackend(self._fleet.scene), self._fleet.starts[todo],
-                          self._width, finished)
+                whole.run([one for one in executions if isinstance(one, Execution)],
+                          MjxBackend(self._fleet.scene), self._fleet.starts[todo], self._width,
+                          finished)
                 return
             run(executions, self._backend(contender.backend), self._fleet.starts[todo],
                 width=self._width, rows=[k % self._width for k in todo], finished=finished)
@@ -249,10 +279,35 @@ class Group:
         return Execution(fleet.missions[k], fleet.scenarios[k], make(), fleet.bodies, fleet.frame,
                          seed=self._seed(k), mode=contender.mode, route=route)
 
+    def _by_the_clock(self, contender: Contender, k: int) -> TimedExecution:
+        fleet = self._fleet
+        mission = by_the_clock(fleet.missions[k])
+        return TimedExecution(mission, fleet.scenarios[k], chooser(contender), fleet.bodies,
+                              fleet.frame, self._roads, seed=self._seed(k))
+
+    @cached_property
+    def _roads(self) -> Roads:
+        fleet = self._fleet
+        return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds))
+
+    def _promises(self, contender: Contender) -> list[Promise]:
+        """What a planner by the clock expects of each mission at its start."""
+        found = []
+        for k in range(len(self._fleet.missions)):
+            execution = self._by_the_clock(contender, k)
+            execution.start(self._fleet.starts[k])
+            assert execution.question is not None
+            execution.planner.act(execution.question)
+            plan = cast(Keeper, execution.planner).plan
+            expected = None if plan is None or plan.makespan is None else plan.makespan / MS
+            found.append(Promise(None, expected))
+        return found
+
     def _seed(self, k: int) -> int:
         return self._all.seed + self._first + k
 
-    def _report(self, contender: Contender, k: int, record: Record, plan: GridPlan) -> Report:
+    def _report(self, contender: Contender, k: int, record: Record, plan: GridPlan | None
+                ) -> Report:
         objective = None if contender.planner == "policy" else contender.objective
         return make_report(
             record, self._fleet.missions[k], self._fleet.frame, self._fleet.bases,
@@ -260,13 +315,14 @@ class Group:
             backend=contender.backend, seed=self._seed(k), grid_plan=plan, kinds=self._fleet.kinds,
             height=self._height)
 
-    def _keep(self, contender: Contender, k: int, report: Report, grid: OnGrid) -> None:
+    def _keep(self, contender: Contender, k: int, report: Report, nominal_s: float | None
+              ) -> None:
         recipe = self._fleet.missions[k].site
         losses = {robot.lost for robot in report.robots if robot.lost}
         by_event = report.cause == "unsolvable" and losses == {"event"}
         row = Row(number=self._first + k, contender=contender.name, site=recipe.preset or "",
                   site_seed=recipe.seed, seed=report.seed, slot=k % self._width,
-                  solvable=not by_event, nominal_s=grid.nominal_s, report=report)
+                  solvable=not by_event, nominal_s=nominal_s, report=report)
         self._all.rows[contender.name, row.number] = row
         self._all.keep(row)
 
@@ -306,13 +362,26 @@ def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) ->
                          planner=execution.planner.name, objective=None, mode="barrier",
                          backend="grid", seed=execution.asked.seed, grid_plan=plan)
     starts = [robot.cell for robot in mission.robots]
-    return OnGrid(on_the_clock(report, times), plan, route_of(record, starts),
-                  round(float(times[-1]), 4))
+    return OnGrid(plan, round(float(times[-1]), 4), on_the_clock(report, times),
+                  route_of(record, starts))
 
 
 def maker(contender: Contender) -> Callable[[], Planner]:
     """Makes the planners of a contender. Raises InputError."""
     return registry.maker(contender.planner, contender.options)
+
+
+def chooser(contender: Contender) -> Keeper:
+    """Who decides for a contender by the clock. Raises InputError."""
+    return Keeper(timed_planners.find(contender.planner).make(contender.options))
+
+
+def by_the_clock(mission: Mission) -> Mission:
+    """A mission in steps with a decision a target."""
+    if mission.events:
+        raise InputError("--mode clock", "takes random missions without events yet; a mission "
+                         "file by the clock can have them")
+    return msgspec.structs.replace(mission, clock="seconds")
 
 
 def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],
@@ -326,7 +395,11 @@ def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[
                 backends if loop != "grid" else ("native",)):
             if backend == "fused" and (loop, mode) != ("closed", "barrier"):
                 continue  # it only knows how to decide again, all together
+            if loop == "oracle" and mode == "clock":
+                continue  # closed with the exact planner
             for who in planners if loop != "oracle" else (exact,):
+                if mode == "clock" and who.planner == "policy":
+                    continue  # policies decide in steps
                 one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
                 if found.setdefault(one.name, one) != one:
                     raise InputError("--planner", f"two would be called {who.who}; rename one")
