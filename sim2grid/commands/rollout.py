@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import msgspec
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from moonteam.version import __version__
 
 if TYPE_CHECKING:
     from moonteam.planners.base import Planner
+    from sim2grid.clock.execution import TimedExecution
     from sim2grid.loop.execution import Execution
     from sim2grid.loop.prepare import Prepared
     from sim2grid.measure.metrics import GridPlan, Report
@@ -53,12 +54,13 @@ class Args(Planning, Printed):
 
     mission: tyro.conf.Positional[str] = ""
     """Mission file (.yaml) or the name of a bundled mission; not with --from."""
-    planner: str = "policy"
+    planner: str | None = None
     """Who decides: a registered planner (policy, exact, greedy, lns, cpsat, exhaustive,
-    another package's), or
-    FILE.py:OBJECT."""
-    mode: Literal["barrier", "async"] = "barrier"
-    """barrier: all robots decide together; async: each decides when it arrives."""
+    another package's), or FILE.py:OBJECT. Default: policy; by the clock exact."""
+    mode: Literal["barrier", "async", "clock"] | None = None
+    """barrier: all robots decide together; async: each decides when it arrives; clock: a decision
+    is a target, planned in seconds and driven at any angle (not by the policy). Default: clock
+    where the mission says clock: seconds, else barrier."""
     backend: Literal["mjx", "native", "fused"] = "mjx"
     """Physics engine: MJX (JAX), C MuJoCo, which is faster on a CPU, or the whole loop on MJX as
     one program, for a policy's likeliest actions in barrier mode."""
@@ -89,9 +91,9 @@ class Run:
     """One mission ready to be run: what to execute, where, and how to call it in the report."""
 
     prepared: Prepared
-    execution: Execution
+    execution: Execution | TimedExecution
     start: npt.NDArray  # [nq]
-    plan: GridPlan
+    plan: GridPlan | None  # None by the clock
     who: str  # the planner's name in the report
     objective: str | None
     backend: str
@@ -174,6 +176,11 @@ def _check(args: Args) -> None:
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise InputError("--out", f"{args.out} is a file; a folder is needed")
     parse(args.decode)
+    if args.mode == "clock" and args.planner == "policy":
+        raise InputError("--planner policy", "decides in steps; by the clock exact, greedy, lns, "
+                         "cpsat, or FILE.py:OBJECT")
+    if args.mode == "clock" and args.backend == "fused":
+        raise InputError("--backend fused", "drives in steps; by the clock mjx or native")
     if args.backend == "fused" and args.viewer:
         raise InputError("--viewer", "shows nothing of --backend fused, which is one program; use "
                          "mjx or native")
@@ -196,23 +203,48 @@ def _check(args: Args) -> None:
 
 def _from_file(args: Args) -> Run:
     """The run of a mission file. Raises InputError for whatever it cannot be."""
+    from moonteam.planners import registry
     from sim2grid.loop.execution import Execution
     from sim2grid.loop.prepare import prepare
 
     mission = _load(args.mission)
-    planner = _planner(args)
+    mode = args.mode or ("clock" if mission.clock == "seconds" else "barrier")
+    if mode == "clock":
+        return _by_the_clock(args, mission)
+    if mission.clock == "seconds":
+        raise InputError(args.mission, "is by the clock, which --mode clock alone executes",
+                         "clock")
+    name = args.planner or "policy"
+    planner = registry.make(name, args.planner_options())
     prepared = prepare(mission, args.mission)
     plan = _grid_plan(prepared, planner, args.seed)
     execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
-                          prepared.frame, seed=args.seed, mode=args.mode)
+                          prepared.frame, seed=args.seed, mode=mode)
     if args.backend == "fused":
         from sim2grid.loop.fused.whole import check
 
         check(execution)
-    who = args.planner if args.planner != "policy" else f"policy {Path(args.policy).stem}"
-    return Run(prepared, execution, prepared.scene.qpos0, plan, args.planner,
-               None if args.planner == "policy" else args.objective, args.backend, args.seed,
+    who = name if name != "policy" else f"policy {Path(args.policy).stem}"
+    return Run(prepared, execution, prepared.scene.qpos0, plan, name,
+               None if name == "policy" else args.objective, args.backend, args.seed,
                f"{mission.name}: {who}", command.line("rollout", args))
+
+
+def _by_the_clock(args: Args, mission: Mission) -> Run:
+    """The run of a mission by the clock. Raises InputError for whatever it cannot be."""
+    from moonteam.planners.seconds import registry
+    from sim2grid.clock.keeper import Keeper
+    from sim2grid.clock.prepare import by_the_clock, execution_of
+    from sim2grid.loop.prepare import prepare
+
+    name = args.planner or "exact"
+    _check(replace(args, planner=name, mode="clock"))
+    prepared = prepare(by_the_clock(mission, args.mission), args.mission)
+    planner = registry.find(name).make(args.planner_options(args.seed))
+    execution = execution_of(prepared, Keeper(planner), args.seed)
+    return Run(prepared, execution, prepared.scene.qpos0, None, name, args.objective,
+               args.backend, args.seed, f"{mission.name}: {name}, by the clock",
+               command.line("rollout", args))
 
 
 def _from_report(args: Args) -> Run:
@@ -236,12 +268,6 @@ def _load(name: str) -> Mission:
     path = paths.find(name, "missions", suffix)
     mission = missions.load(path)
     return msgspec.structs.replace(mission, name=mission.name or path.stem)
-
-
-def _planner(args: Args) -> Planner:
-    from moonteam.planners import registry
-
-    return registry.make(args.planner, args.planner_options())
 
 
 def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:
@@ -310,7 +336,7 @@ def _drive_fused(made: Run) -> dict[str, float]:
     from sim2grid.loop.fused import whole
 
     say("moonteam: compiling the whole loop as one program")
-    execution = made.execution
+    execution = cast("Execution", made.execution)
     compiling, running = whole.run([execution], MjxBackend(made.prepared.scene),
                                    made.start[None], 1)
     return {"compile_s": round(compiling, 3), "wall_s": round(compiling + running, 3),

@@ -19,6 +19,7 @@ from moonteam.physics import look
 from moonteam.physics.render import Marker, on_ground, path, post, square
 from moonteam.physics.scene import set_heights
 from moonteam.robots.base import CONTROL_PERIOD
+from sim2grid.clock.execution import TimedExecution
 from sim2grid.loop.execution import Execution
 from sim2grid.loop.prepare import Prepared
 from sim2grid.show.picture import OPEN, SOLVED, robot_color
@@ -72,7 +73,7 @@ class LiveView:
     def __exit__(self, *error: object) -> None:
         self._window.close()
 
-    def show(self, execution: Execution) -> None:
+    def show(self, execution: Execution | TimedExecution) -> None:
         """Plays what was logged since the last call; nothing once the window is closed."""
         fresh = execution.record.qpos[self._chunks:]
         self._chunks += len(fresh)
@@ -87,7 +88,7 @@ class LiveView:
             self._due = max(self._due + self._period, time.perf_counter() - self._period)
             time.sleep(max(0.0, self._due - time.perf_counter()))
 
-    def _marks(self, execution: Execution) -> None:
+    def _marks(self, execution: Execution | TimedExecution) -> None:
         """Targets by state, where each robot is bound, and the trails."""
         if not self._window.is_running():
             return
@@ -98,7 +99,7 @@ class LiveView:
                 _put(drawn.geoms[drawn.ngeom], marker)
                 drawn.ngeom += 1
 
-    def _markers(self, execution: Execution) -> list[Marker]:
+    def _markers(self, execution: Execution | TimedExecution) -> list[Marker]:
         scene, frame, record = self._prepared.scene, self._prepared.frame, execution.record
         solved = {solve.target for solve in record.solves}
         found: list[Marker] = []

@@ -40,6 +40,7 @@ from moonteam.robots import team
 from moonteam.terrain.travel import Roads
 from sim2grid.clock.execution import TimedExecution
 from sim2grid.clock.keeper import Keeper
+from sim2grid.clock.prepare import by_the_clock
 from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
@@ -281,7 +282,7 @@ class Group:
 
     def _by_the_clock(self, contender: Contender, k: int) -> TimedExecution:
         fleet = self._fleet
-        mission = by_the_clock(fleet.missions[k])
+        mission = by_the_clock(fleet.missions[k], "--mode clock")
         return TimedExecution(mission, fleet.scenarios[k], chooser(contender), fleet.bodies,
                               fleet.frame, self._roads, seed=self._seed(k))
 
@@ -374,14 +375,6 @@ def maker(contender: Contender) -> Callable[[], Planner]:
 def chooser(contender: Contender) -> Keeper:
     """Who decides for a contender by the clock. Raises InputError."""
     return Keeper(timed_planners.find(contender.planner).make(contender.options))
-
-
-def by_the_clock(mission: Mission) -> Mission:
-    """A mission in steps with a decision a target."""
-    if mission.events:
-        raise InputError("--mode clock", "takes random missions without events yet; a mission "
-                         "file by the clock can have them")
-    return msgspec.structs.replace(mission, clock="seconds")
 
 
 def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],

@@ -58,13 +58,14 @@ def plan(what: Named | Mission | Scenario, planner: str = "exact", **options: An
     return registry.make(planner, made).plan(Snapshot.start(_scenario(what)))
 
 
-def rollout(mission: Named | Mission, planner: str = "policy", *, out: Named | None = None,
+def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named | None = None,
             **options: Any) -> Report:
     """A mission in physics, as `moonteam rollout`.
 
     Args:
       mission: a mission, its file, or the name of a bundled one.
-      planner: who decides; a registered planner, or `FILE.py:OBJECT`.
+      planner: who decides; a registered planner, or `FILE.py:OBJECT`. None: the policy, and by the
+        clock the exact planner.
       out: output folder; runs/NAME by default. A `Mission` is written there as mission.yaml.
       **options: of the command, such as backend="native", mode="async" or video=False.
 

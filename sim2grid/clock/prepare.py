@@ -1,0 +1,27 @@
+"""From a mission to its execution by the clock."""
+
+from __future__ import annotations
+
+import msgspec
+
+from moonteam.errors import InputError
+from moonteam.problem.mission import Mission
+from moonteam.robots import team
+from moonteam.terrain.travel import Roads
+from sim2grid.clock.execution import Chooser, TimedExecution
+from sim2grid.loop.prepare import Prepared
+
+
+def by_the_clock(mission: Mission, source: object) -> Mission:
+    """The mission with a decision a target. Raises InputError for events told in decisions."""
+    if mission.clock == "steps" and mission.events:
+        raise InputError(source, "say when by at_s, with clock: seconds; decisions are "
+                         "counted only where the clock is steps", "events")
+    return msgspec.structs.replace(mission, clock="seconds")
+
+
+def execution_of(prepared: Prepared, chooser: Chooser, seed: int) -> TimedExecution:
+    """The mission on its ground, before its start."""
+    roads = Roads.of_mission(prepared.site, prepared.mission, team.limits(prepared.kinds))
+    return TimedExecution(prepared.mission, prepared.scenario, chooser, prepared.bodies,
+                          prepared.frame, roads, seed=seed)
