@@ -2,7 +2,8 @@
 
 From point to point of the raster, each time to the neighbour over which the target is soonest;
 of the polygons over the points passed the quickest is kept (no leg over closed ground), and
-its corners are moved while that makes it quicker, as a string is pulled taut.
+its corners are moved while that makes it quicker, as a string is pulled taut. Two corners close
+together become one where that costs little.
 
 Legend: P points of a way, in steps (x, y); `slow` and `field` as in `field`.
 """
@@ -117,21 +118,29 @@ def _quickest(slow, chain, corner):
 
 @njit(cache=True, nogil=True)
 def _taut(slow, points):
-    """The way, its corners moved a step at a time for as long as that makes it quicker."""
+    """The way, its corners moved by a step, then by less, for as long as that makes it quicker."""
     points = points.copy()
-    for _ in range(ROUNDS):
-        moved = False
-        for i in range(1, len(points) - 1):
-            x, y = points[i]
-            best = _over(slow, points, i, x, y) - 1e-9
-            for dy in (-1, 0, 1):
-                for dx in (-1, 0, 1):
-                    time = _over(slow, points, i, x + dx, y + dy)
-                    if time < best:
-                        best, points[i, 0], points[i, 1], moved = time, x + dx, y + dy, True
-        if not moved:
-            break
+    for stride in (1.0, 0.4):
+        for _ in range(ROUNDS):
+            moved = False
+            for i in range(1, len(points) - 1):
+                moved |= _moved(slow, points, i, stride)
+            if not moved:
+                break
     return points
+
+
+@njit(cache=True, nogil=True)
+def _moved(slow, points, i, stride):
+    """Moves corner i to the quickest of nine places `stride` apart; whether it moved."""
+    x, y = points[i]
+    best, moved = _over(slow, points, i, x, y) - 1e-9, False
+    for dy in (-stride, 0.0, stride):
+        for dx in (-stride, 0.0, stride):
+            time = _over(slow, points, i, x + dx, y + dy)
+            if time < best:
+                best, points[i, 0], points[i, 1], moved = time, x + dx, y + dy, True
+    return moved
 
 
 @njit(cache=True, nogil=True)
