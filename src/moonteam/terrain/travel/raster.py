@@ -87,7 +87,7 @@ def slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
     key = (id(site), raster, limits)
     if key in _KNOWN and _KNOWN[key][0]() is site:
         return _KNOWN[key][1]
-    found = _slowness(site, raster, limits)
+    found = fresh_slowness(site, raster, limits)
     found.setflags(write=False)
     while len(_KNOWN) >= REMEMBERED:
         del _KNOWN[next(iter(_KNOWN))]
@@ -98,7 +98,8 @@ def slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
 _KNOWN: dict[tuple[int, Raster, Limits], tuple[weakref.ref[Site], FloatMap]] = {}
 
 
-def _slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
+def fresh_slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
+    """`slowness`, made anew."""
     points = raster.points()
     if limits.flies:
         slope = step = np.zeros(raster.shape)
@@ -106,7 +107,8 @@ def _slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
         slope, step = ground_under(site, points, limits.footprint)
     able = _kept_clear(judge(site, points, limits, slope, step), raster)
     slowing = limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
-    return np.where(able, 1.0 / (limits.speed * (1.0 - slowing)), np.inf)
+    with np.errstate(divide="ignore"):  # a kind may lose all of its speed
+        return np.where(able, 1.0 / (limits.speed * (1.0 - slowing)), np.inf)
 
 
 def _kept_clear(able: BoolMap, raster: Raster) -> BoolMap:
