@@ -26,6 +26,9 @@ from moonteam.terrain.travel.raster import Raster, slowness
 from moonteam.terrain.travel.ways import way
 from moonteam.terrain.traversability import BoolMap, FloatMap, Limits
 
+MOST_FIELDS = 256
+"""Kept for each kind; the oldest goes first."""
+
 Place = tuple[float, float]
 Floats = npt.NDArray[np.float64]
 Points = npt.NDArray[Any] | Sequence[Any]  # one [2] or several [P, 2], m
@@ -65,16 +68,21 @@ class Ground:
 
     def field(self, to: Place) -> Floats:
         """[H + 2, W + 2] s from everywhere to the target at `to` steps."""
-        if to not in self.fields:
-            self.fields[to] = self._solved(to)
-        return self.fields[to]
+        found = self.fields.get(to)
+        if found is None:
+            found = self._solved(to)
+            while len(self.fields) >= MOST_FIELDS:
+                self.fields.pop(next(iter(self.fields)), None)
+            self.fields[to] = found
+        return found
 
     def _solved(self, to: Place) -> Floats:
         if self.plain:
             rows, columns = (np.arange(-1.0, n - 1.0) for n in self.slow.shape)
             return self.slow * np.hypot(columns[None, :] - to[0], rows[:, None] - to[1])
-        if to in self.known:
-            return renew(self.slow, *self.known.pop(to))
+        before = self.known.pop(to, None)
+        if before is not None:
+            return renew(self.slow, *before)
         return solve(self.slow, *to)
 
     def closed(self, shut: BoolMap) -> Ground:
@@ -131,6 +139,8 @@ class Roads:
     def matrix(self, kind: str, starts: Points, to: Points) -> Floats:
         """Seconds [F, T] from each of starts [F, 2] m to each of `to` [T, 2] m."""
         ground, begin, ends = self._ground(kind), self._steps(starts), self._steps(to)
+        if ground.plain:
+            return np.linalg.norm(begin[:, None] - ends[None], axis=-1) * ground.slow[1, 1]
         columns = [look_ups(ground.slow, ground.field(_key(end)), end, begin) for end in ends]
         return np.stack(columns, axis=1) if columns else np.zeros((len(begin), 0))
 

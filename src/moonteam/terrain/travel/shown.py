@@ -43,7 +43,7 @@ class Shown:
     def draw(self, path: Path) -> Path:
         """Isochrones and ways over the shaded ground; the picture's path."""
         title = (f"{self.site.name}, seed {self.site.seed}: seconds of a {self.kind} robot to "
-                 f"({self.to[0]:g}, {self.to[1]:g}) m; red: closed to it")
+                 f"({self.to[0]:g}, {self.to[1]:g}) m; red: closed or cut off")
         return preview.draw_travel(
             self.site, path, title, self.roads.raster.half, self.roads.field(self.kind, self.to),
             [(way.points, way.seconds) for way in self.ways])
