@@ -6,7 +6,7 @@ between two accepted points, of the eight triangles about it instead of the usua
 which makes the error about a third (Tsitsiklis' own scheme for eight neighbours). Within REACH
 of the target, and from there on by marching, times begin as those of straight lines.
 
-Legend: `slow` and `field` are [H + 2, W + 2], s a step and s, within a border of infinity.
+Legend: `slow` and `field` are [H + 2, W + 2], s a spacing and s, within a border of infinity.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ LEAVE = 4.0
 """Steps over which a robot that stands on closed ground may leave it."""
 
 WIDTH = 0.7
-"""Of a bucket of the queue, in times over the fastest step."""
+"""Of a bucket of the queue, in times over the fastest spacing."""
 
 DIAGONAL = math.sqrt(2.0)
 
 
 @njit(cache=True, nogil=True)
 def solve(slow, x, y):
-    """The field [H + 2, W + 2] of a target at (x, y) steps; infinite where no way leads to it."""
+    """The field [H + 2, W + 2] of a target at (x, y) spacings; infinite where no way is."""
     field = np.full(slow.shape, np.inf)
     first = np.zeros(slow.shape, np.bool_)
     if at(slow, x, y) < np.inf:
@@ -163,11 +163,11 @@ def _across(pace, times, node, there, beside):
 
 @njit(cache=True, nogil=True)
 def look_up(slow, field, to, x, y):
-    """Seconds from (x, y) steps to the target `to` [2] of the field; infinite where no way is.
+    """Seconds from (x, y) spacings to the target `to` [2] of the field; infinite where no way is.
 
     Near the target that of the straight line, beside closed ground that over a point that can be
     seen, elsewhere bilinear. From closed ground, the nearest way out first; who stands within half
-    a step of the target is there even so.
+    a spacing of the target is there even so.
     """
     away = math.hypot(x - to[0], y - to[1])
     if away <= REACH:
@@ -199,7 +199,7 @@ def look_up(slow, field, to, x, y):
 def leave(slow, field, x, y):
     """The way out of closed ground at (x, y): seconds to the target, and the point (x, y).
 
-    It is taken straight, over at most LEAVE steps, and counted at half the slowest speed.
+    It is taken straight, over at most LEAVE spacings, and counted at half the slowest speed.
     """
     pace = 0.0
     for value in slow.ravel():
@@ -216,5 +216,5 @@ def leave(slow, field, x, y):
 
 @njit(cache=True, nogil=True)
 def look_ups(slow, field, to, points):
-    """`look_up` from each of `points` [P, 2] steps: [P] s."""
+    """`look_up` from each of `points` [P, 2] spacings: [P] s."""
     return np.array([look_up(slow, field, to, point[0], point[1]) for point in points])

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from moonteam.errors import InputError
 from moonteam.report import clock
 from moonteam.terrain.site import Site
 from moonteam.terrain.travel.raster import Raster, fresh_slowness
@@ -45,7 +46,7 @@ def measure(site: Site, raster: Raster, limits: Mapping[str, Limits], targets: i
     _fields(network, places)
     known = _in_turns({"known": lambda: [network.matrix(k, places, places) for k in slow]},
                       repeats)["known"]
-    return {"site": site.name, "points": list(raster.shape[::-1]), "step_m": raster.step,
+    return {"site": site.name, "points": list(raster.shape[::-1]), "spacing_m": raster.spacing,
             "kinds": list(slow), "targets": targets, "scipy": importlib.metadata.version("scipy"),
             "rows": rows, "matrices_again": known.document(), "rasters": rasters.document(),
             "ways": [_ways(rng, network, kind) for kind in slow]}
@@ -63,7 +64,7 @@ def _rasters(site: Site, raster: Raster, limits: Mapping[str, Limits], repeats: 
 
 
 def _fields(network: Roads, places: npt.NDArray[np.float64]) -> list[FloatMap]:
-    return [network.field(kind, to) for kind in network.grounds for to in places]
+    return [network.field(kind, to) for kind in network.kinds for to in places]
 
 
 def _in_turns(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, clock.Times]:
@@ -84,6 +85,8 @@ def _open_places(rng: np.random.Generator, raster: Raster, slow: Mapping[str, Fl
                  count: int) -> npt.NDArray[np.float64]:
     """Points [count, 2] m that are open to all kinds."""
     able = np.logical_and.reduce([np.isfinite(its) for its in slow.values()])
+    if not able.any():
+        raise InputError("bench travel", "no ground of this site is open to all kinds")
     points = raster.points()[able]
     return points[rng.choice(len(points), count, replace=len(points) < count)]
 
@@ -91,7 +94,7 @@ def _open_places(rng: np.random.Generator, raster: Raster, slow: Mapping[str, Fl
 def _on_points(raster: Raster, places: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     """Row and column [P, 2] of places [P, 2] m that are points."""
     middle = (np.array(raster.shape) - 1) / 2
-    return np.rint(places[:, ::-1] / raster.step + middle).astype(np.int64)
+    return np.rint(places[:, ::-1] / raster.spacing + middle).astype(np.int64)
 
 
 def _graph(raster: Raster, slow: FloatMap) -> csr_array:
@@ -103,7 +106,7 @@ def _graph(raster: Raster, slow: FloatMap) -> csr_array:
         left, right = max(0, -dx), columns - max(0, dx)
         a = (slice(0, rows - dy), slice(left, right))
         b = (slice(dy, rows), slice(left + dx, right + dx))
-        seconds = np.hypot(dx, dy) * raster.step * (slow[a] + slow[b]) / 2
+        seconds = np.hypot(dx, dy) * raster.spacing * (slow[a] + slow[b]) / 2
         able = np.isfinite(seconds)
         begin.append(index[a][able])
         end.append(index[b][able])

@@ -5,7 +5,7 @@ of the polygons over the points passed the quickest is kept (no leg over closed 
 its corners are moved while that makes it quicker, as a string is pulled taut. Two corners close
 together become one where that costs little.
 
-Legend: P points of a way, in steps (x, y); `slow` and `field` as in `field`.
+Legend: P points of a way, in spacings (x, y); `slow` and `field` as in `field`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from moonteam.terrain.travel.field import DIAGONAL, REACH, leave
 from moonteam.terrain.travel.lines import at, line_seconds
 
 CORNER = 1.0
-"""What a way may take longer for each waypoint that it does without, in fastest steps."""
+"""What a way may take longer for each waypoint that it does without, in fastest spacings."""
 
 BESIDE = 4.0
-"""Two corners this near each other, in steps, may become one."""
+"""Two corners this near each other, in spacings, may become one."""
 
 ROUNDS = 60
 """Of moving the corners, at most."""
@@ -118,7 +118,7 @@ def _quickest(slow, chain, corner):
 
 @njit(cache=True, nogil=True)
 def _taut(slow, points):
-    """The way, its corners moved by a step, then by less, for as long as that makes it quicker."""
+    """The way, its corners moved by a spacing, then by less, while that makes it quicker."""
     points = points.copy()
     for stride in (1.0, 0.4):
         for _ in range(ROUNDS):
