@@ -41,7 +41,8 @@ def solve(slow, x, y):
             for column in range(max(0, int(x - REACH)), min(columns, int(x + REACH) + 2)):
                 open_here = slow[row + 1, column + 1] < np.inf
                 if open_here and math.hypot(column - x, row - y) <= REACH:
-                    field[row + 1, column + 1] = line_seconds(slow, x, y, column, row)
+                    field[row + 1, column + 1] = line_seconds(
+                        slow, x, y, float(column), float(row))
                     first[row + 1, column + 1] = field[row + 1, column + 1] < np.inf
     return _marched(slow, field, first)
 
@@ -82,19 +83,19 @@ def _march(pace, times, first, width, room):
     time falls once more waits once more, so that the times are those of strict order. False if
     more than `room` points had to wait in one bucket.
     """
-    rate, buckets = _buckets(pace, times, first)
+    rate, buckets, soonest = _buckets(pace, times, first)
     waiting, size = np.empty((buckets, room), np.int32), np.zeros(buckets, np.int32)
     where = np.full(times.size, -1, np.int64)  # the bucket that a point is in
     around = np.array([1, width + 1, width, width - 1, -1, -width - 1, -width, -width + 1])
-    mask, left, bucket = buckets - 1, 0, 0
-    starts = np.flatnonzero(first)
-    for node in starts[np.argsort(times[starts])]:
+    mask, left, bucket = buckets - 1, 0, int(soonest * rate)
+    for node in range(times.size):
+        if not first[node]:
+            continue
         here = int(times[node] * rate)
         if size[here & mask] == room:
             return False
         where[node], waiting[here & mask, size[here & mask]] = here, node
         size[here & mask] += 1
-        bucket = here if left == 0 else bucket
         left += 1
     while left > 0:
         here = bucket & mask
@@ -130,17 +131,19 @@ def _march(pace, times, first, width, room):
 
 @njit(cache=True, nogil=True)
 def _buckets(pace, times, first):
-    """Buckets a second, and how many are in use at once, a power of two."""
+    """Buckets a second, how many are in use at once, a power of two, and the first of times."""
     least, most, soonest, latest = np.inf, 0.0, np.inf, 0.0
     for node in range(times.size):
         if pace[node] < np.inf:
             least, most = min(least, pace[node]), max(most, pace[node])
         if first[node]:
             soonest, latest = min(soonest, times[node]), max(latest, times[node])
+    if soonest == np.inf:
+        return 1.0, 1, 0.0
     width, buckets = WIDTH * least, 4
-    while soonest < np.inf and buckets * width < latest - soonest + 2.0 * most + 2.0 * width:
+    while buckets * width < latest - soonest + 2.0 * most + 2.0 * width:
         buckets *= 2
-    return 1.0 / width, buckets
+    return 1.0 / width, buckets, soonest
 
 
 @njit(cache=True, nogil=True)
@@ -190,7 +193,7 @@ def look_up(slow, field, to, x, y):
     for i in range(2):
         for j in range(2):
             if near[i, j] < best:
-                time = near[i, j] + line_seconds(slow, x, y, column + j, row + i)
+                time = near[i, j] + line_seconds(slow, x, y, float(column + j), float(row + i))
                 best = min(best, time)
     return best
 

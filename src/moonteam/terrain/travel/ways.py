@@ -69,7 +69,7 @@ def _descend(slow, field, x, y, to_x, to_y):
         return np.empty((0, 2))
     while True:
         near = math.hypot(column - to_x, row - to_y) <= REACH
-        if near and line_seconds(slow, column, row, to_x, to_y) < np.inf:
+        if near and line_seconds(slow, float(column), float(row), to_x, to_y) < np.inf:
             break
         chain.append((float(column), float(row)))
         here, best, dx, dy = field[row + 1, column + 1], np.inf, 0, 0
