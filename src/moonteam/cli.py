@@ -46,6 +46,7 @@ COMMANDS = {
     "export": ("moonteam.commands.export", "a policy as an ONNX file that runs without JAX"),
     "site": ("moonteam.commands.site", "make, import and preview lunar terrain"),
     "bench grid": ("moonteam.commands.bench_grid", "planner and grid env speed"),
+    "bench travel": ("moonteam.commands.bench_travel", "travel in seconds: speed and exactness"),
     "bench train": ("training.commands.bench_train", "training throughput"),
     "bench physics": ("moonteam.commands.bench_physics", "physics steps per second"),
     "bench execution": ("sim2grid.commands.bench_execution", "missions in physics per second"),

@@ -40,7 +40,26 @@ def test_execution_step_by_step(capsys):
     assert row["real_time_factor"] == pytest.approx(row["simulated_s"] / row["wall_s"])
 
 
+def test_travel_beside_dijkstra(capsys, tmp_path):
+    words = ["bench", "travel", "--side", "8", "--targets", "2", "--repeats", "2"]
+    assert cli.main([*words, "--json", "--out", str(tmp_path)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / "bench_travel.json").read_text()) == report
+    ours, peer = report["rows"]
+    assert ours["fields"] == peer["fields"] == 2 * len(report["kinds"])
+    assert ours["error_mean"] < ours["error_worst"] < 0.01 < peer["error_mean"]
+    assert peer["error_worst"] == pytest.approx(2**0.5 * (2 - 2**0.5)**0.5 - 1, abs=0.003)
+    assert all(abs(row[f"field_over_way_{key}"]) < 0.05 for row in report["ways"]
+               for key in ("least", "median", "most"))
+    assert cli.main([*words, "--markdown"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "`moonteam bench travel --side 8 --targets 2 --repeats 2`"
+    assert lines[2].startswith("| solver | first call | 6 fields, median |")
+
+
 def test_bad_numbers_give_one_line(capsys):
+    assert cli.main(["bench", "travel", "--targets", "0"]) == 2
+    assert cli.main(["bench", "travel", "--side", "1000"]) == 2
     assert cli.main(["bench", "physics", "--worlds", "0"]) == 2
     assert cli.main(["bench", "physics", "--samples", "5"]) == 2
     assert cli.main(["bench", "physics", "--threads", "0"]) == 2
@@ -48,5 +67,5 @@ def test_bad_numbers_give_one_line(capsys):
     assert cli.main(["bench", "execution", "--seconds", "0"]) == 2
     assert cli.main(["bench", "execution", "--policy", "nobody"]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 6
+    assert len(lines) == 8
     assert all(line.startswith("moonteam: ") for line in lines)

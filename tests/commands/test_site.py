@@ -33,7 +33,27 @@ def test_a_site_is_made_measured_and_drawn(tmp_path, capsys):
     assert again["relief_m"] == pytest.approx(report["relief_m"], abs=1e-4)
 
 
+def test_travel_is_told_and_drawn(tmp_path, capsys):
+    words = ["site", "--preset", "mare", "--seed", "3", "--size", "18", "--travel", "wheeled",
+             "--to", "2", "-3"]
+    assert main([*words, "--json", "--out", str(tmp_path)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["files"][-1] == str(tmp_path / "travel.png")
+    assert (tmp_path / "travel.png").read_bytes().startswith(b"\x89PNG")
+    travel = report["travel"]
+    assert 0.5 < travel["reached"] <= 1.0
+    assert len(travel["ways"]) == 4
+    for way in travel["ways"]:
+        assert way["points"][-1] == [2.0, -3.0]
+        assert way["arrivals"][-1] == pytest.approx(way["seconds"], abs=2e-3)
+        assert way["metres"] / 0.5 <= way["seconds"] * 1.001 <= travel["most_seconds"] * 1.05
+    assert main([*words, "--start", "-6", "5"]) == 0
+    assert "from -6, 5 m: " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("words", "told"), [
+    (["--travel", "mule"], "mule"), (["--travel", "drone", "--to", "90", "0"], "off the map"),
+    (["--travel", "drone", "--start", "0", "-90"], "off the map"),
     (["--size", "1"], "4 to 1000"), (["--seed", "-1"], "--seed"), (["--cell", "0"], "--cell"),
     (["--dem", "nowhere.tif"], "no such file"),
 ])

@@ -25,11 +25,13 @@ class Args(Saved, Printed):
     Writes heights.npy and heights.tif, site.json (measured slopes, roughness, crater counts
     against the law), maps.npz (by kind the cells that are open and the seconds to cross each),
     and pictures: hillshade, slope, roughness, traversability by kind.
+    With --travel also a map of a kind's seconds to a place, with ways to it.
 
     Examples:
       moonteam site --preset mare --seed 3 --size 32 --out runs/site
       moonteam site --dem moon.tif --size 40 --centre 120 -35 --detrend --out runs/dem
       moonteam site --dem heights.npy --pixel 1.0 --json
+      moonteam site --preset highland --travel KIND --to 5 -3 --out runs/site
     """
 
     preset: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
@@ -68,6 +70,14 @@ class Args(Saved, Printed):
     detail: bool = True
     """add relief finer than --dem, continuing its power spectrum"""
 
+    travel: str | None = None
+    """a kind of robot: how many seconds it needs to --to, and ways (travel.png in --out)"""
+
+    to: tuple[float, float] = (0.0, 0.0)
+    """where --travel leads, m east and north of the site's centre"""
+
+    start: tuple[float, float] | None = None
+    """where the way of --travel begins; if not given, ways from about the four corners"""
 
 
 def run(args: Args) -> int:
@@ -81,14 +91,29 @@ def run(args: Args) -> int:
     site = _site(args)
     seconds = _seconds(site, args.cell)
     report = measure(site) | _summary(seconds)
+    travel = None if args.travel is None else _travel(site, args, args.travel)
+    if travel is not None:
+        report["travel"] = travel.document
     if args.out is not None:
         report["files"] = _write(site, args.out, args.cell, seconds)
+        if travel is not None:
+            report["files"].append(str(travel.draw(args.out / "travel.png")))
         files.write_json(args.out / "site.json", report)
     if args.json:
         print(files.dump_json(report))
     else:
         _show(report)
     return 0
+
+
+def _travel(site: Site, args: Args, kind: str) -> Any:
+    """What --travel asks for. Raises InputError for an unknown kind or a place off the map."""
+    from moonteam.robots import KINDS
+    from moonteam.terrain.preview import grid_of
+    from moonteam.terrain.travel.shown import show
+
+    size = grid_of(site, args.cell)
+    return show(site, size, args.cell, kind, KINDS.get(kind).limits, args.to, args.start)
 
 
 def _site(args: Args) -> Site:
@@ -164,5 +189,13 @@ def _show(report: dict[str, Any]) -> None:
         print(f"  {kind}: {100 * share:.1f} % of cells open" + (
             f", {times['median']:.2f} s to cross one (at most {times['most']:.2f})"
             if times else ""))
+    if "travel" in report:
+        its = report["travel"]
+        print(f"  {its['kind']} to {its['to'][0]:g}, {its['to'][1]:g} m: from "
+              f"{100 * its['reached']:.1f} % of the map, at most {its['most_seconds']:.1f} s")
+        for way in its["ways"]:
+            (x, y), corners = way["points"][0], len(way["points"]) - 2
+            print(f"    from {x:g}, {y:g} m: {way['seconds']:.1f} s over {way['metres']:.1f} m, "
+                  f"{corners} corner{'' if corners == 1 else 's'}")
     for name in report.get("files", []):
         print(f"  {name}")

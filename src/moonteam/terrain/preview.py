@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from moonteam import files
 from moonteam.terrain.measure import roughness_map, slope_map
@@ -98,6 +100,52 @@ def _draw_traversability(site: Site, path: Path, cell_m: float, times: dict[str,
     with files.replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
     return path
+
+
+def draw_travel(site: Site, path: Path, title: str, half: tuple[float, float], seconds: FloatMap,
+                ways: Sequence[tuple[npt.NDArray[np.float64], float]]) -> Path:
+    """Isochrones to a target over the shaded ground, and ways to it; the picture's path.
+
+    `seconds` [H, W] at points over a map of half widths `half` (x, y) m, infinite where closed;
+    `ways`: points [P, 2] m, the target last, and how many seconds each takes.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patheffects import withStroke
+
+    figure = Figure(figsize=(7.2, 6.2), layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower", extent=_box(site))
+    x, y = (np.linspace(-h, h, n) for h, n in zip(half, seconds.shape[::-1], strict=True))
+    able = np.isfinite(seconds)
+    reached = np.ma.masked_invalid(seconds)
+    levels = _levels(float(seconds[able].max()) if able.any() else 1.0)
+    bands = axes.contourf(x, y, reached, levels=levels, cmap="viridis", alpha=0.4)
+    lines = axes.contour(x, y, reached, levels=levels[1:], colors="white", linewidths=0.7)
+    axes.clabel(lines, levels[2::2], fmt="%g", fontsize=7)
+    sides = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    axes.imshow(np.ma.masked_array(np.ones_like(seconds), able), cmap="Reds", vmin=0, vmax=1.3,
+                alpha=0.8, origin="lower", interpolation="nearest",
+                extent=(x[0] - sides[0], x[-1] + sides[0], y[0] - sides[1], y[-1] + sides[1]))
+    _rocks(axes, site)
+    halo = [withStroke(linewidth=2.5, foreground="black")]
+    for points, takes in ways:
+        axes.plot(*points.T, "-", color="orange", linewidth=1.6, path_effects=halo)
+        axes.plot(*points[:-1].T, "o", color="orange", markersize=3.5, path_effects=halo)
+        axes.annotate(f"{takes:.0f} s", points[0], xytext=(5, 5), textcoords="offset points",
+                      color="white", fontsize=9, path_effects=halo)
+    if ways:
+        axes.plot(*ways[0][0][-1], "*", color="gold", markersize=15, markeredgecolor="black")
+    figure.colorbar(bands, ax=axes, shrink=0.85, label="s to the star")
+    _finish(figure, axes, title, path)
+    return path
+
+
+def _levels(most: float) -> npt.NDArray[np.float64]:
+    """Seconds of isochrones, round and about ten, from 0 to past `most`."""
+    rough = max(most, 1e-6) / 10
+    unit = 10.0 ** np.floor(np.log10(rough))
+    step = unit * next(n for n in (1, 2, 2.5, 5, 10) if n * unit >= rough * (1 - 1e-9))
+    return step * np.arange(np.ceil(most / step) + 1.5)
 
 
 def _rocks(axes: Any, site: Site) -> None:

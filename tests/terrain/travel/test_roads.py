@@ -37,7 +37,7 @@ def crossed(network, kind, points):
         share = (np.arange(4000) + 0.5) / 4000
         on = a + share[:, None] * (b - a)
         half = np.array(slow.shape[::-1]) // 2
-        at = np.floor(on / network.raster.step + half + 0.5).astype(int)
+        at = np.floor(on / network.raster.spacing + half + 0.5).astype(int)
         at = np.clip(at, 0, 2 * half)
         able &= np.isinf(slow[at[:, 1], at[:, 0]]).mean() < 1e-3
         seconds += length * slow[at[:, 1], at[:, 0]].mean()
@@ -267,7 +267,7 @@ def test_points_stand_on_centres_of_cells(cell_m):
     raster = Raster((3, 5), cell_m)
     points = raster.points()
     assert points.shape == (*raster.shape, 2)
-    assert raster.step <= 0.25 + 1e-12
+    assert raster.spacing <= 0.25 + 1e-12
     network = Roads.of_slowness(raster, {"robot": np.ones(raster.shape)})
     for cell in ((0, 0), (2, 4), (1, 2)):
         away = np.linalg.norm(points - network.centre(cell), axis=-1)

@@ -6,7 +6,7 @@ between two accepted points, of the eight triangles about it instead of the usua
 which makes the error about a third (Tsitsiklis' own scheme for eight neighbours). Within REACH
 of the target, and from there on by marching, times begin as those of straight lines.
 
-Legend: `slow` and `field` are [H + 2, W + 2], s a step and s, within a border of infinity.
+Legend: `slow` and `field` are [H + 2, W + 2], s a spacing and s, within a border of infinity.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ LEAVE = 4.0
 """Steps over which a robot that stands on closed ground may leave it."""
 
 WIDTH = 0.7
-"""Of a bucket of the queue, in times over the fastest step."""
+"""Of a bucket of the queue, in times over the fastest spacing."""
 
 DIAGONAL = math.sqrt(2.0)
 
 
 @njit(cache=True, nogil=True)
 def solve(slow, x, y):
-    """The field [H + 2, W + 2] of a target at (x, y) steps; infinite where no way leads to it."""
+    """The field [H + 2, W + 2] of a target at (x, y) spacings; infinite where no way is."""
     field = np.full(slow.shape, np.inf)
     first = np.zeros(slow.shape, np.bool_)
     if at(slow, x, y) < np.inf:
@@ -41,7 +41,8 @@ def solve(slow, x, y):
             for column in range(max(0, int(x - REACH)), min(columns, int(x + REACH) + 2)):
                 open_here = slow[row + 1, column + 1] < np.inf
                 if open_here and math.hypot(column - x, row - y) <= REACH:
-                    field[row + 1, column + 1] = line_seconds(slow, x, y, column, row)
+                    field[row + 1, column + 1] = line_seconds(
+                        slow, x, y, float(column), float(row))
                     first[row + 1, column + 1] = field[row + 1, column + 1] < np.inf
     return _marched(slow, field, first)
 
@@ -82,19 +83,19 @@ def _march(pace, times, first, width, room):
     time falls once more waits once more, so that the times are those of strict order. False if
     more than `room` points had to wait in one bucket.
     """
-    rate, buckets = _buckets(pace, times, first)
+    rate, buckets, soonest = _buckets(pace, times, first)
     waiting, size = np.empty((buckets, room), np.int32), np.zeros(buckets, np.int32)
     where = np.full(times.size, -1, np.int64)  # the bucket that a point is in
     around = np.array([1, width + 1, width, width - 1, -1, -width - 1, -width, -width + 1])
-    mask, left, bucket = buckets - 1, 0, 0
-    starts = np.flatnonzero(first)
-    for node in starts[np.argsort(times[starts])]:
+    mask, left, bucket = buckets - 1, 0, int(soonest * rate)
+    for node in range(times.size):
+        if not first[node]:
+            continue
         here = int(times[node] * rate)
         if size[here & mask] == room:
             return False
         where[node], waiting[here & mask, size[here & mask]] = here, node
         size[here & mask] += 1
-        bucket = here if left == 0 else bucket
         left += 1
     while left > 0:
         here = bucket & mask
@@ -130,17 +131,19 @@ def _march(pace, times, first, width, room):
 
 @njit(cache=True, nogil=True)
 def _buckets(pace, times, first):
-    """Buckets a second, and how many are in use at once, a power of two."""
+    """Buckets a second, how many are in use at once, a power of two, and the first of times."""
     least, most, soonest, latest = np.inf, 0.0, np.inf, 0.0
     for node in range(times.size):
         if pace[node] < np.inf:
             least, most = min(least, pace[node]), max(most, pace[node])
         if first[node]:
             soonest, latest = min(soonest, times[node]), max(latest, times[node])
+    if soonest == np.inf:
+        return 1.0, 1, 0.0
     width, buckets = WIDTH * least, 4
-    while soonest < np.inf and buckets * width < latest - soonest + 2.0 * most + 2.0 * width:
+    while buckets * width < latest - soonest + 2.0 * most + 2.0 * width:
         buckets *= 2
-    return 1.0 / width, buckets
+    return 1.0 / width, buckets, soonest
 
 
 @njit(cache=True, nogil=True)
@@ -163,11 +166,11 @@ def _across(pace, times, node, there, beside):
 
 @njit(cache=True, nogil=True)
 def look_up(slow, field, to, x, y):
-    """Seconds from (x, y) steps to the target `to` [2] of the field; infinite where no way is.
+    """Seconds from (x, y) spacings to the target `to` [2] of the field; infinite where no way is.
 
     Near the target that of the straight line, beside closed ground that over a point that can be
     seen, elsewhere bilinear. From closed ground, the nearest way out first; who stands within half
-    a step of the target is there even so.
+    a spacing of the target is there even so.
     """
     away = math.hypot(x - to[0], y - to[1])
     if away <= REACH:
@@ -190,7 +193,7 @@ def look_up(slow, field, to, x, y):
     for i in range(2):
         for j in range(2):
             if near[i, j] < best:
-                time = near[i, j] + line_seconds(slow, x, y, column + j, row + i)
+                time = near[i, j] + line_seconds(slow, x, y, float(column + j), float(row + i))
                 best = min(best, time)
     return best
 
@@ -199,7 +202,7 @@ def look_up(slow, field, to, x, y):
 def leave(slow, field, x, y):
     """The way out of closed ground at (x, y): seconds to the target, and the point (x, y).
 
-    It is taken straight, over at most LEAVE steps, and counted at half the slowest speed.
+    It is taken straight, over at most LEAVE spacings, and counted at half the slowest speed.
     """
     pace = 0.0
     for value in slow.ravel():
@@ -216,5 +219,5 @@ def leave(slow, field, x, y):
 
 @njit(cache=True, nogil=True)
 def look_ups(slow, field, to, points):
-    """`look_up` from each of `points` [P, 2] steps: [P] s."""
+    """`look_up` from each of `points` [P, 2] spacings: [P] s."""
     return np.array([look_up(slow, field, to, point[0], point[1]) for point in points])

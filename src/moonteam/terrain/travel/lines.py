@@ -1,8 +1,8 @@
 """Straight lines over a raster: seconds along them, compiled with Numba.
 
-Points of the raster stand at whole numbers of steps (x, y), each in the middle of a square of
+Points of the raster stand at whole numbers of spacings (x, y), each in the middle of a square of
 its slowness. `slow` is [H + 2, W + 2], the raster within a border of infinity; times are in
-seconds where slowness is in seconds a step.
+seconds where slowness is in seconds a spacing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TOUCH = 1e-9
 
 @njit(cache=True, nogil=True)
 def at(slow, x, y):
-    """Slowness at (x, y) steps, off the raster that of its nearest square."""
+    """Slowness at (x, y) spacings, off the raster that of its nearest square."""
     row = min(max(math.floor(y + 0.5), 0), slow.shape[0] - 3)
     column = min(max(math.floor(x + 0.5), 0), slow.shape[1] - 3)
     return slow[row + 1, column + 1]

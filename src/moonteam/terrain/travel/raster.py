@@ -34,18 +34,18 @@ REMEMBERED = 32
 
 @dataclass(frozen=True)
 class Raster:
-    """Points `step` m apart over a map of `size` (W, H) cells, its centre at the origin."""
+    """Points `spacing` m apart over a map of `size` (W, H) cells, its centre at the origin."""
 
     size: tuple[int, int]
     cell_m: float  # m, side of a cell
 
     @property
     def parts(self) -> int:
-        """Steps in a cell's side: even, so that there is a point on its centre."""
+        """Spacings in a cell's side: even, so that there is a point on its centre."""
         return 2 * math.ceil(self.cell_m / 2 / POINT_SPACING - 1e-9)
 
     @property
-    def step(self) -> float:
+    def spacing(self) -> float:
         """Between two points, m; at most POINT_SPACING."""
         return self.cell_m / self.parts
 
@@ -69,7 +69,7 @@ class Raster:
     def points(self) -> npt.NDArray[np.float64]:
         """Where the points are, [H, W, 2] m."""
         rows, columns = self.shape
-        x, y = (self.step * (np.arange(n) - (n - 1) / 2) for n in (columns, rows))
+        x, y = (self.spacing * (np.arange(n) - (n - 1) / 2) for n in (columns, rows))
         return np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
 
     def within(self, centre: npt.ArrayLike, reach: tuple[float, float]) -> BoolMap:
@@ -87,7 +87,7 @@ def slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
     key = (id(site), raster, limits)
     if key in _KNOWN and _KNOWN[key][0]() is site:
         return _KNOWN[key][1]
-    found = _slowness(site, raster, limits)
+    found = fresh_slowness(site, raster, limits)
     found.setflags(write=False)
     while len(_KNOWN) >= REMEMBERED:
         del _KNOWN[next(iter(_KNOWN))]
@@ -98,7 +98,8 @@ def slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
 _KNOWN: dict[tuple[int, Raster, Limits], tuple[weakref.ref[Site], FloatMap]] = {}
 
 
-def _slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
+def fresh_slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
+    """`slowness`, made anew."""
     points = raster.points()
     if limits.flies:
         slope = step = np.zeros(raster.shape)
@@ -106,7 +107,8 @@ def _slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
         slope, step = ground_under(site, points, limits.footprint)
     able = _kept_clear(judge(site, points, limits, slope, step), raster)
     slowing = limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
-    return np.where(able, 1.0 / (limits.speed * (1.0 - slowing)), np.inf)
+    with np.errstate(divide="ignore"):  # a kind may lose all of its speed
+        return np.where(able, 1.0 / (limits.speed * (1.0 - slowing)), np.inf)
 
 
 def _kept_clear(able: BoolMap, raster: Raster) -> BoolMap:
@@ -114,13 +116,13 @@ def _kept_clear(able: BoolMap, raster: Raster) -> BoolMap:
 
     What lies off the map is not asked for: who strays there is as safe as its border.
     """
-    reach = int(raster.stray / raster.step + 1e-9)
+    reach = int(raster.stray / raster.spacing + 1e-9)
     padded = np.pad(able, reach, mode="edge")
     rows, columns = able.shape
     clear = np.ones_like(able)
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
-            if math.hypot(dx, dy) * raster.step <= raster.stray + 1e-9:
+            if math.hypot(dx, dy) * raster.spacing <= raster.stray + 1e-9:
                 clear &= padded[reach + dy:reach + dy + rows, reach + dx:reach + dx + columns]
     return clear
 

@@ -26,6 +26,9 @@ from moonteam.terrain.travel.raster import Raster, slowness
 from moonteam.terrain.travel.ways import way
 from moonteam.terrain.traversability import BoolMap, FloatMap, Limits
 
+MOST_FIELDS = 256
+"""Kept for each kind; the oldest goes first."""
+
 Place = tuple[float, float]
 Floats = npt.NDArray[np.float64]
 Points = npt.NDArray[Any] | Sequence[Any]  # one [2] or several [P, 2], m
@@ -54,41 +57,49 @@ class Way:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """One kind's ground, and the fields known over it. `slow` is s a step, as `field` has it."""
+class Fields:
+    """One kind's fields, made as they are asked for, over its slowness.
 
-    slow: Floats  # [H + 2, W + 2] s a step, within a border of infinity
+    `slow` and fields are as `field` has them; targets are (x, y) spacings from the first point.
+    """
+
+    slow: Floats  # [H + 2, W + 2] s a spacing, within a border of infinity
     plain: bool  # everywhere open and alike: ways are straight
-    fields: dict[Place, Floats] = field(default_factory=dict)  # [H + 2, W + 2] s, by target
+    found: dict[Place, Floats] = field(default_factory=dict)  # [H + 2, W + 2] s, by target
     known: dict[Place, tuple[Floats, float]] = field(default_factory=dict)
     """Fields from before ground was closed, and up to how many s they still stand."""
 
     def field(self, to: Place) -> Floats:
-        """[H + 2, W + 2] s from everywhere to the target at `to` steps."""
-        if to not in self.fields:
-            self.fields[to] = self._solved(to)
-        return self.fields[to]
+        """[H + 2, W + 2] s from everywhere to the target at `to` spacings."""
+        found = self.found.get(to)
+        if found is None:
+            found = self._solved(to)
+            while len(self.found) >= MOST_FIELDS:
+                self.found.pop(next(iter(self.found)), None)
+            self.found[to] = found
+        return found
 
     def _solved(self, to: Place) -> Floats:
         if self.plain:
             rows, columns = (np.arange(-1.0, n - 1.0) for n in self.slow.shape)
             return self.slow * np.hypot(columns[None, :] - to[0], rows[:, None] - to[1])
-        if to in self.known:
-            return renew(self.slow, *self.known.pop(to))
+        before = self.known.pop(to, None)
+        if before is not None:
+            return renew(self.slow, *before)
         return solve(self.slow, *to)
 
-    def closed(self, shut: BoolMap) -> Ground:
-        """The ground with points [H, W] that are shut; fields that this changes are dropped."""
+    def closed(self, shut: BoolMap) -> Fields:
+        """With points [H, W] that are shut; fields that this changes are dropped."""
         inner = np.pad(shut, 1) & np.isfinite(self.slow)
         if not inner.any():
             return self
-        fresh = Ground(np.where(inner, np.inf, self.slow), False)
+        fresh = Fields(np.where(inner, np.inf, self.slow), False)
         slowest = float(self.slow[np.isfinite(self.slow)].max())
         for to, (seconds, until) in (self.known | {
-                to: (its, math.inf) for to, its in self.fields.items()}).items():
+                to: (its, math.inf) for to, its in self.found.items()}).items():
             soonest = min(float(seconds[inner].min()) - 3.0 * slowest, until)
             if soonest == math.inf:
-                fresh.fields[to] = seconds
+                fresh.found[to] = seconds
             elif soonest > REACH * slowest:
                 fresh.known[to] = seconds, soonest
         return fresh
@@ -99,7 +110,7 @@ class Roads:
     """Seconds and ways of each kind over the map of a mission. Made by its class methods."""
 
     raster: Raster
-    grounds: Mapping[str, Ground]
+    kinds: Mapping[str, Fields]
 
     @classmethod
     def over(cls, site: Site, size: tuple[int, int], cell_m: float,
@@ -112,7 +123,7 @@ class Roads:
     @classmethod
     def of_slowness(cls, raster: Raster, slow: Mapping[str, FloatMap]) -> Roads:
         """Where seconds per metre [H, W] are known for each kind; infinite: closed."""
-        return cls(raster, {kind: _ground(its * raster.step) for kind, its in slow.items()})
+        return cls(raster, {kind: _fields(its * raster.spacing) for kind, its in slow.items()})
 
     @classmethod
     def of_mission(cls, site: Site, mission: Mission, limits: Mapping[str, Limits]) -> Roads:
@@ -121,8 +132,8 @@ class Roads:
 
     def passable(self, kind: str, xy: Points) -> bool:
         """Whether a robot of the kind may be sent to xy [2] m."""
-        place = self._steps([xy])[0]
-        return bool(at(self._ground(kind).slow, *place) < np.inf)
+        place = self._placed([xy])[0]
+        return bool(at(self._of(kind).slow, *place) < np.inf)
 
     def seconds(self, kind: str, start: Points, to: Points) -> float:
         """Seconds from start [2] m to [2] m; infinite where there is no way."""
@@ -130,27 +141,29 @@ class Roads:
 
     def matrix(self, kind: str, starts: Points, to: Points) -> Floats:
         """Seconds [F, T] from each of starts [F, 2] m to each of `to` [T, 2] m."""
-        ground, begin, ends = self._ground(kind), self._steps(starts), self._steps(to)
-        columns = [look_ups(ground.slow, ground.field(_key(end)), end, begin) for end in ends]
+        its, begin, ends = self._of(kind), self._placed(starts), self._placed(to)
+        if its.plain:
+            return np.linalg.norm(begin[:, None] - ends[None], axis=-1) * its.slow[1, 1]
+        columns = [look_ups(its.slow, its.field(_key(end)), end, begin) for end in ends]
         return np.stack(columns, axis=1) if columns else np.zeros((len(begin), 0))
 
     def field(self, kind: str, to: Points) -> FloatMap:
         """Seconds [H, W] from every point of the raster to `to` [2] m; infinite: no way."""
-        return self._ground(kind).field(_key(self._steps([to])[0]))[1:-1, 1:-1]
+        return self._of(kind).field(_key(self._placed([to])[0]))[1:-1, 1:-1]
 
     def slowness(self, kind: str) -> FloatMap:
         """Seconds per metre [H, W] at every point of the raster; infinite where it is closed."""
-        return self._ground(kind).slow[1:-1, 1:-1] / self.raster.step
+        return self._of(kind).slow[1:-1, 1:-1] / self.raster.spacing
 
     def way(self, kind: str, start: Points, to: Points) -> Way:
         """The way from start [2] m to `to` [2] m. Raises InputError if there is none."""
-        ground, begin = self._ground(kind), self._steps([start])[0]
-        end = self._steps([to])[0]
-        points, legs = way(ground.slow, ground.field(_key(end)), *begin, *end)
+        its, begin = self._of(kind), self._placed([start])[0]
+        end = self._placed([to])[0]
+        points, legs = way(its.slow, its.field(_key(end)), *begin, *end)
         if len(points) == 0:
             raise InputError("way", f"there is no way for a {kind} robot from "
                              f"{_written(start)} to {_written(to)} over this ground")
-        points = (points - self._middle) * self.raster.step
+        points = (points - self._middle) * self.raster.spacing
         points[0], points[-1] = start, to
         return Way(points, legs)
 
@@ -161,11 +174,11 @@ class Roads:
         nearer than robots stray is closed too. Only fields that this changes are made again, from
         where it changes them, when they are asked for.
         """
-        self._steps([xy])
+        self._placed([xy])
         reach = (self.raster.cell_m / 2 if half is None else half) + self.raster.stray
         shut = self.raster.within(xy, (reach, reach))
-        return replace(self, grounds={**self.grounds,
-                                      kind: self._ground(kind).closed(shut)})
+        return replace(self, kinds={**self.kinds,
+                                      kind: self._of(kind).closed(shut)})
 
     def close_cell(self, kind: str, cell: tuple[int, int]) -> Roads:
         """`close` for a cell (x, y) of the map, origin lower left."""
@@ -182,14 +195,14 @@ class Roads:
         rows, columns = self.raster.shape
         return np.array([(columns - 1) / 2, (rows - 1) / 2])
 
-    def _ground(self, kind: str) -> Ground:
-        if kind not in self.grounds:
+    def _of(self, kind: str) -> Fields:
+        if kind not in self.kinds:
             raise InputError("kind", f"no roads for {kind!r}; there are for "
-                             + ", ".join(self.grounds))
-        return self.grounds[kind]
+                             + ", ".join(self.kinds))
+        return self.kinds[kind]
 
-    def _steps(self, xy: Points) -> Floats:
-        """Points [P, 2] m in steps from the raster's first. Raises InputError off the map.
+    def _placed(self, xy: Points) -> Floats:
+        """Points [P, 2] m in spacings from the raster's first. Raises InputError off the map.
 
         Half a cell off is still taken for its border, as elsewhere: robots stray.
         """
@@ -200,15 +213,15 @@ class Roads:
             raise InputError("point", f"{_written(points[off][0])} m is off the map, which reaches "
                              f"{half[0]:g} m east and west, {half[1]:g} m north and south of its "
                              "centre")
-        return np.clip(points, -half, half) / self.raster.step + self._middle
+        return np.clip(points, -half, half) / self.raster.spacing + self._middle
 
 
-def _ground(slow: FloatMap) -> Ground:
-    return Ground(np.pad(slow, 1, constant_values=np.inf), bool(slow.min() == slow.max() < np.inf))
+def _fields(slow: FloatMap) -> Fields:
+    return Fields(np.pad(slow, 1, constant_values=np.inf), bool(slow.min() == slow.max() < np.inf))
 
 
-def _key(steps: Floats) -> Place:
-    return round(float(steps[0]), 6), round(float(steps[1]), 6)
+def _key(spacings: Floats) -> Place:
+    return round(float(spacings[0]), 6), round(float(spacings[1]), 6)
 
 
 def _written(xy: npt.ArrayLike) -> str:

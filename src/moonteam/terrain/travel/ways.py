@@ -2,9 +2,10 @@
 
 From point to point of the raster, each time to the neighbour over which the target is soonest;
 of the polygons over the points passed the quickest is kept (no leg over closed ground), and
-its corners are moved while that makes it quicker, as a string is pulled taut.
+its corners are moved while that makes it quicker, as a string is pulled taut. Two corners close
+together become one where that costs little.
 
-Legend: P points of a way, in steps (x, y); `slow` and `field` as in `field`.
+Legend: P points of a way, in spacings (x, y); `slow` and `field` as in `field`.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from moonteam.terrain.travel.field import DIAGONAL, REACH, leave
 from moonteam.terrain.travel.lines import at, line_seconds
 
 CORNER = 1.0
-"""What a way may take longer for each waypoint that it does without, in fastest steps."""
+"""What a way may take longer for each waypoint that it does without, in fastest spacings."""
 
 BESIDE = 4.0
-"""Two corners this near each other, in steps, may become one."""
+"""Two corners this near each other, in spacings, may become one."""
 
 ROUNDS = 60
 """Of moving the corners, at most."""
@@ -68,7 +69,7 @@ def _descend(slow, field, x, y, to_x, to_y):
         return np.empty((0, 2))
     while True:
         near = math.hypot(column - to_x, row - to_y) <= REACH
-        if near and line_seconds(slow, column, row, to_x, to_y) < np.inf:
+        if near and line_seconds(slow, float(column), float(row), to_x, to_y) < np.inf:
             break
         chain.append((float(column), float(row)))
         here, best, dx, dy = field[row + 1, column + 1], np.inf, 0, 0
@@ -117,21 +118,29 @@ def _quickest(slow, chain, corner):
 
 @njit(cache=True, nogil=True)
 def _taut(slow, points):
-    """The way, its corners moved a step at a time for as long as that makes it quicker."""
+    """The way, its corners moved by a spacing, then by less, while that makes it quicker."""
     points = points.copy()
-    for _ in range(ROUNDS):
-        moved = False
-        for i in range(1, len(points) - 1):
-            x, y = points[i]
-            best = _over(slow, points, i, x, y) - 1e-9
-            for dy in (-1, 0, 1):
-                for dx in (-1, 0, 1):
-                    time = _over(slow, points, i, x + dx, y + dy)
-                    if time < best:
-                        best, points[i, 0], points[i, 1], moved = time, x + dx, y + dy, True
-        if not moved:
-            break
+    for stride in (1.0, 0.4):
+        for _ in range(ROUNDS):
+            moved = False
+            for i in range(1, len(points) - 1):
+                moved |= _moved(slow, points, i, stride)
+            if not moved:
+                break
     return points
+
+
+@njit(cache=True, nogil=True)
+def _moved(slow, points, i, stride):
+    """Moves corner i to the quickest of nine places `stride` apart; whether it moved."""
+    x, y = points[i]
+    best, moved = _over(slow, points, i, x, y) - 1e-9, False
+    for dy in (-stride, 0.0, stride):
+        for dx in (-stride, 0.0, stride):
+            time = _over(slow, points, i, x + dx, y + dy)
+            if time < best:
+                best, points[i, 0], points[i, 1], moved = time, x + dx, y + dy, True
+    return moved
 
 
 @njit(cache=True, nogil=True)
