@@ -1,0 +1,307 @@
+"""Annealing over lists of targets and their teams. For Numba.
+
+Legend: N agents, M targets, P places in a team, L changed targets of a move.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from moonteam.planners.seconds.decode import choose, enough
+
+
+class Plan(NamedTuple):
+    """A list of targets and their teams, and what the schedule looks like before each of them."""
+
+    order: Any  # [M] int64
+    place: Any  # [M] int64 where each target is in the order
+    team: Any  # [M, P] int64
+    size: Any  # [M] int64 of each target's team; 0: to be chosen
+    begin: Any  # [M] int64 ms of start of each target's service
+    clock: Any  # [M + 1, N] int64 ms at which each agent is free before the i-th service
+    last: Any  # [M + 1, N] int64 its last target, or -1
+    sums: Any  # [M + 1, 3] float64 so far: latest end, weighted travel, ms of lateness
+
+
+class Goal(NamedTuple):
+    """Cost = makespan * alpha + effort * beta + soft * (the agents' ends, their fourth mean)."""
+
+    alpha: float
+    beta: float
+    soft: float
+    fine: float  # cost of a ms of lateness
+
+
+class Scratch(NamedTuple):
+    """Space to work in."""
+
+    clock: Any  # [N]
+    last: Any  # [N]
+    begin: Any  # [M]
+    reach: Any  # [N]
+    want: Any  # [S]
+    changed: Any  # [M] targets whose teams the move changes
+    old_team: Any  # [M, P]
+    old_size: Any  # [M]
+    result: Any  # [4] float64: cost, makespan, effort, lateness
+
+
+@njit(cache=True, nogil=True)
+def decode(work, plan, space, goal, first, most, near, noise):
+    """The cost of the list, whose first `first` services are as they were; infinity above `most`.
+
+    Fills the teams that are to be chosen, `space.begin` of the others, and `space.result`.
+    """
+    order, place, team, size, begin = plan.order, plan.place, plan.team, plan.size, plan.begin
+    start, between, classes, ready, late = (work.start, work.between, work.classes, work.ready,
+                                            work.late)
+    service, effort, home, idle_way = work.service, work.effort, work.home, work.idle_way
+    first_before, before = work.first_before, work.before
+    clock, last, trial = space.clock, space.last, space.begin
+    m, n = order.shape[0], clock.shape[0]
+    for a in range(n):
+        clock[a] = plan.clock[first, a]
+        last[a] = plan.last[first, a]
+    latest, way, over = plan.sums[first, 0], plan.sums[first, 1], plan.sums[first, 2]
+    slope = goal.alpha + goal.soft / np.sqrt(np.sqrt(1.0 * n))
+    beta, fine = goal.beta, goal.fine
+    for i in range(first, m):
+        t = order[i]
+        if size[t] == 0:
+            size[t] = choose(work, t, last, clock, near, noise, team[t], space.reach, space.want)
+            if size[t] == 0:
+                return np.inf
+        when = ready[t]
+        for e in range(first_before[t], first_before[t + 1]):
+            b = before[e]
+            when = max(when, (begin[b] if place[b] < first else trial[b]) + service[b])
+        for k in range(size[t]):
+            a = team[t, k]
+            leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
+            way += effort[a] * leg
+            when = max(when, clock[a] + leg)
+        trial[t] = when
+        end = when + service[t]
+        for k in range(size[t]):
+            a = team[t, k]
+            clock[a] = end
+            last[a] = t
+        latest = max(latest, float(end))
+        if when > late[t]:
+            over += when - late[t]
+        if slope * latest + beta * way + fine * over > most:
+            return np.inf
+    fourth = 0.0
+    for a in range(n):
+        leg = idle_way[a] if last[a] < 0 else home[a, last[a]]
+        end = float(clock[a] + leg)
+        way += effort[a] * leg
+        latest = max(latest, end)
+        fourth += end * end * end * end
+    over += max(0.0, latest - work.limit)
+    fourth = np.sqrt(np.sqrt(fourth / n))
+    result = space.result
+    result[0] = goal.alpha * latest + beta * way + goal.soft * fourth + fine * over
+    result[1], result[2], result[3] = latest, way, over
+    return result[0]
+
+
+@njit(cache=True, nogil=True)
+def settle(work, plan, space, first):
+    """Takes down the schedule just made: the list sorted by start, what is before each place."""
+    order, begin, place, team, size = plan.order, plan.begin, plan.place, plan.team, plan.size
+    start, between, classes, effort = work.start, work.between, work.classes, work.effort
+    clock, last, sums = plan.clock, plan.last, plan.sums
+    m, n = order.shape[0], clock.shape[1]
+    low = first
+    for i in range(first, m):
+        t = order[i]
+        when = space.begin[t]
+        begin[t] = when
+        j = i
+        while j > 0 and begin[order[j - 1]] > when:
+            order[j] = order[j - 1]
+            j -= 1
+        order[j] = t
+        low = min(low, j)
+    for i in range(low, m):
+        t = order[i]
+        place[t] = i
+        for a in range(n):
+            clock[i + 1, a] = clock[i, a]
+            last[i + 1, a] = last[i, a]
+        end = begin[t] + work.service[t]
+        way = 0.0
+        for k in range(size[t]):
+            a = team[t, k]
+            leg = start[a, t] if last[i, a] < 0 else between[classes[a], last[i, a], t]
+            way += effort[a] * leg
+            clock[i + 1, a] = end
+            last[i + 1, a] = t
+        sums[i + 1, 0] = max(sums[i, 0], float(end))
+        sums[i + 1, 1] = sums[i, 1] + way
+        sums[i + 1, 2] = sums[i, 2] + max(0, begin[t] - work.late[t])
+
+
+@njit(cache=True, nogil=True)
+def shift(plan, i, j):
+    """Takes the target at place i to place j."""
+    t = plan.order[i]
+    step = 1 if j > i else -1
+    for k in range(i, j, step):
+        plan.order[k] = plan.order[k + step]
+        plan.place[plan.order[k]] = k
+    plan.order[j] = t
+    plan.place[t] = j
+
+
+@njit(cache=True, nogil=True)
+def room(work, plan, i):
+    """First and last place to which the target at place i can be taken."""
+    t = plan.order[i]
+    low, high = 0, plan.order.shape[0] - 1
+    for e in range(work.first_before[t], work.first_before[t + 1]):
+        low = max(low, plan.place[work.before[e]] + 1)
+    for e in range(work.first_then[t], work.first_then[t + 1]):
+        high = min(high, plan.place[work.then[e]] - 1)
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def keep(plan, space, count, t):
+    """Remembers the team of target t before it is changed."""
+    space.changed[count] = t
+    space.old_size[count] = plan.size[t]
+    for i in range(plan.size[t]):
+        space.old_team[count, i] = plan.team[t, i]
+    return count + 1
+
+
+@njit(cache=True, nogil=True)
+def exchange_tails(work, plan, space, p):
+    """Two agents take over each other's services from place p on; how many teams it changes."""
+    m = plan.order.shape[0]
+    n = work.free.shape[0]
+    a, b = np.random.randint(n), np.random.randint(n)
+    if a == b:
+        return 0
+    count = 0
+    for i in range(p, m):
+        t = plan.order[i]
+        at, bt = -1, -1
+        for k in range(plan.size[t]):
+            if plan.team[t, k] == a:
+                at = k
+            elif plan.team[t, k] == b:
+                bt = k
+        if (at < 0) == (bt < 0):
+            continue
+        spot, other = (at, b) if at >= 0 else (bt, a)
+        if not enough(work, t, plan.team[t], plan.size[t], spot, other):
+            continue
+        count = keep(plan, space, count, t)
+        plan.team[t, spot] = other
+    return count
+
+
+@njit(cache=True, nogil=True)
+def replace(work, plan, space, t, count):
+    """Another agent for one of the team of t."""
+    n = work.free.shape[0]
+    spot = np.random.randint(plan.size[t])
+    for _ in range(4):
+        a = np.random.randint(n)
+        inside = False
+        for k in range(plan.size[t]):
+            inside |= plan.team[t, k] == a
+        if not inside and enough(work, t, plan.team[t], plan.size[t], spot, a):
+            count = keep(plan, space, count, t)
+            plan.team[t, spot] = a
+            return count
+    return count
+
+
+@njit(cache=True, nogil=True)
+def anneal(work, plan, space, goal, true, now, hot, cold, iterations, seed, mix, best_order,
+           best_team, best_size, best):
+    """`iterations` moves from temperature `hot` to `cold`, in units of cost.
+
+    `now` is the plan's cost; `best` [4] the best one's true cost (then makespan, effort,
+    lateness), kept with its list. Returns the cost that the plan has in the end.
+    """
+    np.random.seed(seed)
+    m = plan.order.shape[0]
+    ratio = (cold / hot) ** (1.0 / max(1, iterations))
+    warm = hot
+    for _ in range(iterations):
+        warm *= ratio
+        i = np.random.randint(m)
+        t = plan.order[i]
+        first, count, kind, j = i, 0, 0, i
+        u = np.random.random()
+        if u < mix[0]:  # to another place
+            low, high = room(work, plan, i)
+            reach = max(2, int(m * mix[4]))
+            low, high = max(low, i - reach), min(high, i + reach)
+            j = low + np.random.randint(high - low + 1)
+            if j == i:
+                continue
+            kind = 1
+            if np.random.random() < mix[5]:
+                count = keep(plan, space, count, t)
+                plan.size[t] = 0
+            first = min(i, j)
+            shift(plan, i, j)
+        elif u < mix[1]:  # another team, chosen anew
+            count = keep(plan, space, count, t)
+            plan.size[t] = 0
+        elif u < mix[2]:  # one of the team replaced
+            count = replace(work, plan, space, t, count)
+        elif u < mix[3]:
+            count = exchange_tails(work, plan, space, i)
+        else:  # two targets change their places
+            reach = max(2, int(m * mix[4]))
+            j = min(m - 1, i + 1 + np.random.randint(reach))
+            o = plan.order[j]
+            if room(work, plan, i)[1] < j or room(work, plan, j)[0] > i or j == i:
+                continue
+            kind = 2
+            plan.order[i], plan.order[j] = o, t
+            plan.place[t], plan.place[o] = j, i
+            if np.random.random() < mix[5]:
+                count = keep(plan, space, count, t)
+                plan.size[t] = 0
+                count = keep(plan, space, count, o)
+                plan.size[o] = 0
+        if kind == 0 and count == 0:
+            continue
+        most = now - warm * np.log(1.0 - np.random.random())
+        cost = decode(work, plan, space, goal, first, most, mix[6] * np.random.random(),
+                      mix[7] * np.random.random())
+        if cost <= most:
+            now = cost
+            settle(work, plan, space, first)
+            real = space.result[1] * true.alpha + space.result[2] * true.beta + true.fine * (
+                space.result[3])
+            if real < best[0]:
+                best[0] = real
+                best[1:] = space.result[1:]
+                best_order[:] = plan.order
+                best_team[:] = plan.team
+                best_size[:] = plan.size
+            continue
+        if kind == 1:
+            shift(plan, j, i)
+        elif kind == 2:
+            o = plan.order[i]
+            plan.order[i], plan.order[j] = t, o
+            plan.place[t], plan.place[o] = i, j
+        for c in range(count - 1, -1, -1):
+            o = space.changed[c]
+            plan.size[o] = space.old_size[c]
+            for k in range(plan.size[o]):
+                plan.team[o, k] = space.old_team[c, k]
+    return now

@@ -1,0 +1,123 @@
+"""The exact planner by the clock, against everything tried."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from moonteam.errors import InputError
+from moonteam.planners.seconds import exact
+from moonteam.planners.seconds.base import NEVER, effort, makespan, problems
+from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.planners.seconds.exhaustive import ExhaustivePlanner
+from moonteam.planners.seconds.goal import value
+
+OBJECTIVES = ("makespan", "effort", "weighted")
+
+
+def judged(now, plan):
+    """The plan, if it is what it says."""
+    assert problems(now, plan.services) == []
+    assert (plan.makespan, plan.effort) == (makespan(now, plan.services),
+                                            effort(now, plan.services))
+    return plan
+
+
+def compare(seeds, instance, most=5):
+    """Statuses seen; every value must be that of the plain search to the millisecond."""
+    seen = []
+    for seed in seeds:
+        now = instance(seed, most)
+        for objective in OBJECTIVES:
+            goal = (objective, 1.0, 0.3)
+            wanted, got = ExhaustivePlanner(*goal).plan(now), ExactPlanner(*goal).plan(now)
+            assert got.status == wanted.status, f"seed {seed}, {objective}"
+            seen.append(got.status)
+            if wanted.status == "infeasible":
+                assert got.reason
+                continue
+            judged(now, got)
+            assert value(*goal, got.makespan, got.effort) == pytest.approx(
+                wanted.bound, abs=1e-6, rel=0), f"seed {seed}, {objective}"
+            assert got.bound == pytest.approx(wanted.bound, abs=1e-6, rel=0)
+    return seen
+
+
+def test_every_combination_of_options_agrees_with_everything_tried(instances):
+    seen = compare(range(100), instances.instance, most=3)
+    seen += compare(range(1000, 1050), instances.instance, most=4)
+    seen += compare(range(2000, 2005), instances.instance, most=5)
+    assert 20 < seen.count("infeasible") < 150
+
+
+@pytest.mark.soak
+def test_many_more_agree(instances):
+    compare(range(150, 650), instances.instance)
+
+
+def test_stopped_early_it_is_feasible_with_a_valid_bound(instances, monkeypatch):
+    monkeypatch.setattr(exact, "_CHUNK", 1)
+    seen = set()
+    for seed in range(12):
+        now = instances.large(seed, 3, 7, skills=2, most=1)
+        for objective in OBJECTIVES:
+            goal = (objective, 1.0, 0.3)
+            best = judged(now, ExactPlanner(*goal).plan(now))
+            early = ExactPlanner(*goal, time_limit=1e-9).plan(now)
+            seen.add(early.status)
+            judged(now, early)
+            assert best.status == "optimal"
+            assert early.bound <= best.bound + 1e-6
+            assert value(*goal, early.makespan, early.effort) >= best.bound - 1e-6
+    assert "feasible" in seen
+
+
+def test_from_the_middle_of_a_plan_what_remains_is_what_it_costs(instances):
+    """After the first service has ended everybody stands where it is; the rest costs the rest."""
+    for seed in range(10):
+        now = instances.large(seed, 3, 6, skills=2, most=1)
+        plan = ExactPlanner().plan(now)
+        first = plan.services[0]
+        j, team = first.target, list(first.agents)
+        start, free, solved, ends = (now.start.copy(), now.free.copy(), now.solved.copy(),
+                                     now.ends.copy())
+        start[team], free[team], solved[j] = now.between[0, j], first.end, True
+        ends[j] = first.end
+        home_now = now.home_now.copy()
+        home_now[team] = now.home[team, j]
+        rest = replace(now, start=start, free=free, solved=solved, ends=ends, home_now=home_now)
+        again = judged(rest, ExactPlanner().plan(rest))
+        assert again.makespan == plan.makespan
+
+
+def test_reasons_are_named(instances):
+    now = instances.large(0, 2, 3, skills=2, most=1)
+    alone = replace(now, present=np.array([True, False]))
+    assert "needs 1 agents with skill 1; the team has 0" in ExactPlanner().plan(alone).reason
+    after = np.zeros((3, 3), bool)
+    after[0, 1] = after[1, 0] = True
+    circle = replace(now, after=after)
+    assert ExactPlanner().plan(circle).reason == "targets [0, 1] wait for each other"
+    tight = replace(now, limit=1)
+    assert "limit of 1 ms" in ExactPlanner().plan(tight).reason
+    short = replace(now, lapses=np.zeros(3, np.int64))
+    assert "lapse" in ExactPlanner().plan(short).reason
+    shut = replace(now, home=np.full_like(now.home, NEVER))
+    assert "ways" in ExactPlanner().plan(shut).reason
+
+
+def test_nothing_open_is_an_empty_plan(instances):
+    now = instances.large(0, 2, 3, skills=2, most=1)
+    done = replace(now, solved=np.ones(3, bool), ends=np.array([5, 9, 2]))
+    plan = judged(done, ExactPlanner().plan(done))
+    assert (plan.status, plan.services, plan.makespan) == ("optimal", (), 9)
+    assert ExactPlanner().plan(replace(done, limit=8)).status == "infeasible"
+
+
+def test_too_much_and_nonsense_are_refused(instances):
+    with pytest.raises(InputError, match="15 targets are open"):
+        ExactPlanner().plan(instances.large(0, 3, 15))
+    with pytest.raises(InputError, match="not one of"):
+        ExactPlanner("moves")
+    with pytest.raises(InputError, match="not allowed"):
+        ExactPlanner("weighted", alpha=-1.0)
