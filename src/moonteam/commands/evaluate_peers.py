@@ -40,7 +40,7 @@ class Args(Seeded, Limited, Reported):
     """Planner by the clock, or FILE.py:OBJECT; again for more. Default: exact on sets of at most
     10 targets, and lns."""
     time_limit: Many[tuple[float, ...]] = ()
-    """Seconds a problem that anytime planners may take; again for more. Default: theirs (lns: 1)."""
+    """Seconds a problem that anytime planners may take; again for more. Default: theirs; lns: 1."""
 
 
 def bundled() -> tuple[str, ...]:
