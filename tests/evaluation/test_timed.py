@@ -46,6 +46,16 @@ def test_a_published_schedule_is_feasible_and_takes_what_they_say(problems):
     assert base.makespan(now, tuple(services)) == pytest.approx(570167.11, abs=2)
 
 
+def test_the_exact_planner_proves_the_published_optima_again(problems):
+    document = timed.evaluate(problems, timed.contenders(Options(["exact", "greedy"])), 0, "", "")
+    exact, greedy = document["summary"]
+    assert exact["certified"] == 1.0
+    for row in document["rows"][:len(problems)]:
+        assert row["makespan"] == pytest.approx(row["optimal"]["makespan"], abs=0.005)
+    assert greedy["success"] == 1.0
+    assert greedy["makespan_gap"] > abs(exact["makespan_gap"])
+
+
 def test_every_figure_is_in_the_sets_own_unit(problems):
     document = timed.evaluate(problems, rows("Nearest"), 0, "title", "command")
     row, = document["summary"]
@@ -112,6 +122,22 @@ def test_the_registry_says_what_is_no_planner():
         registry.find(f"{FILE}:NOT_A_PLANNER")
     with pytest.raises(InputError, match="which has no plan"):
         registry.find(f"{FILE}:makes_nothing").make(PlannerOptions())
+
+
+@pytest.mark.parametrize("name", ["exact", "greedy", "lns", "exhaustive"])
+def test_planners_of_ours_are_found_and_take_their_options(name):
+    planner = registry.find(name).make(PlannerOptions(time_limit=0.2, seed=3))
+    now = base.moment(timed.WARM)
+    plan = planner.plan(now)
+    assert base.problems(now, plan.services) == []
+    assert plan.makespan == base.makespan(now, plan.services)
+
+
+def test_small_sets_are_planned_by_exact_too_where_no_planner_is_named(problems):
+    assert [row.name for row in peers.contenders(problems, (), (), 0)] == ["exact", "lns"]
+    large = loading.load("peers/heteromrta")
+    assert [row.name for row in peers.contenders(large, (), (0.5, 2.0), 0)] == [
+        "lns(0.5 s)", "lns(2 s)"]
 
 
 def test_differences_are_paired_and_counted():

@@ -40,7 +40,7 @@ class Args(Seeded, Limited, Reported):
     """Planner by the clock, or FILE.py:OBJECT; again for more. Default: exact on sets of at most
     10 targets, and lns."""
     time_limit: Many[tuple[float, ...]] = ()
-    """Seconds a problem that anytime planners may take; again for more. Default: 1."""
+    """Seconds a problem that anytime planners may take; again for more. Default: theirs; lns: 1."""
 
 
 def bundled() -> tuple[str, ...]:
@@ -69,7 +69,7 @@ def run(args: Args) -> int:
     from moonteam.report import command, provenance, tables
 
     sets = {Path(name).stem: load(name, args.limit) for name in args.sets or bundled()}
-    rows = {name: peers.contenders(found, args.planner, args.time_limit or (1.0,), args.seed)
+    rows = {name: peers.contenders(found, args.planner, args.time_limit, args.seed)
             for name, found in sets.items()}
     done, lacking = peers.run_all(sets, rows, args.seed)
     document: dict = {

@@ -130,11 +130,17 @@ def table_csv(document: dict) -> str:
     return out.getvalue()
 
 
+_IN_STEPS: dict[str, Any] = {
+    "id": "", "planner": "", "success": False, "makespan": None, "moves": 0,
+    "optimal": {"makespan": None, "moves": None}}
+"""A row of a report in steps, for the header where there is none."""
+
+
 def rows_csv(document: dict) -> str:
     """One row a scenario and planner as CSV; the optima, where they are known, at the end."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    first = document["rows"][0]
+    first = next(iter(document["rows"]), _IN_STEPS)
     keys, best = [key for key in first if key != "optimal"], list(first["optimal"])
     writer.writerow(keys + [f"optimal_{key}" for key in best])
     for row in document["rows"]:
