@@ -73,7 +73,7 @@ class TimedExecution:
 
     def __init__(self, mission: Mission, scenario: Scenario, planner: Chooser,
                  bodies: Sequence[Body], frame: Frame, roads: Roads, *, seed: int = 0,
-                 rules: Rules | None = None, settle: Floats | None = None):
+                 rules: Rules | None = None):
         self.asked = Asked(mission, scenario, planner, bodies, frame, seed,  # type: ignore[arg-type]
                            "clock", rules or Rules())
         self.known, self.book = Known(self.asked), Logbook(self.asked)
@@ -83,7 +83,6 @@ class TimedExecution:
         self.question: Moment | None = None
         self.finished = False
         self.errands: list[Errand] = []
-        self.settle = np.zeros(len(bodies)) if settle is None else settle
         self._happenings = Happenings(self)
         self._due = True
 
@@ -105,7 +104,7 @@ class TimedExecution:
     def moment(self) -> Moment:
         """The mission as it stands."""
         return self.task.moment(self.roads, self.known.xy, self.known.speeds, self.errands,
-                                self.known.mask, self.solved, self.book.time, self.settle)
+                                self.known.mask, self.solved, self.book.time)
 
     def start(self, qpos: npt.ArrayLike) -> None:
         """Takes the robots' first pose, qpos [nq], and comes to the first decision."""
@@ -123,8 +122,10 @@ class TimedExecution:
         known, xy = self.known, self.known.xy
         going = np.array([e.phase == "going" for e in self.errands]) & known.mask
         places = np.array([e.place for e in self.errands])
-        aims = np.array([steer.carrot(e.points, p) if e.phase == "going" else e.place
-                         for e, p in zip(self.errands, xy, strict=True)])
+        # What flies brakes for where it is sent, so it is sent to the end of each piece.
+        ahead = np.where(self.asked.grounded, steer.AHEAD, np.inf)
+        aims = np.array([steer.carrot(e.points, p, a) if e.phase == "going" else e.place
+                         for e, p, a in zip(self.errands, xy, ahead.tolist(), strict=True)])
         points, holds = steer.mind(
             xy, aims, places, going, self.asked.grounded,
             np.array([body.footprint for body in self.asked.bodies]),

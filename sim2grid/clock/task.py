@@ -66,14 +66,15 @@ class Task:
         return [self.names.index(name) for name in self.targets[target].after]
 
     def moment(self, roads: Roads, xy: Floats, speeds: Floats, errands: Sequence[Errand],
-               present: Bools, solved: Bools, now: float, settle: Floats) -> Moment:
+               present: Bools, solved: Bools, now: float) -> Moment:
         """The mission at second `now`, with robots at `xy` [R, 2] m as fast as `speeds` [R] m/s.
 
-        Everybody who is in no service can be sent elsewhere. `settle` [R] s are what coming to
-        rest at a target costs each robot besides the way.
+        Everybody who is in no service can be sent elsewhere. Beside the way a robot needs its
+        `settle` seconds for each place.
         """
         robots, count = len(xy), len(self.targets)
         pace = np.array([body.speed for body in self.bodies]) / speeds
+        settle = [body.settle for body in self.bodies]
         points = self.points
         at, free = self.frame.on_map(xy), np.zeros(robots, np.int64)
         under_way, ends = solved.copy(), np.zeros(count, np.int64)
@@ -89,8 +90,9 @@ class Task:
             start[i] = _ms(pace[i] * roads.matrix(kind, at[i:i + 1], points)[0] + settle[i])
             between[i] = _ms(pace[i] * roads.matrix(kind, points, points) + settle[i])
             if (goal := self.homes[i]) is not None:
-                home[i] = _ms(pace[i] * roads.matrix(kind, points, goal[None])[:, 0])
-                home_now[i] = _ms(pace[i] * roads.matrix(kind, at[i:i + 1], goal[None])[:, 0])[0]
+                home[i] = _ms(pace[i] * roads.matrix(kind, points, goal[None])[:, 0] + settle[i])
+                home_now[i] = _ms(pace[i] * roads.matrix(kind, at[i:i + 1], goal[None])[:, 0]
+                                  + settle[i])[0]
         for i, errand in enumerate(errands):
             if errand.phase == "there":
                 start[i, errand.choice] = 0

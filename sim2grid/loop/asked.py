@@ -33,6 +33,7 @@ class Body:
     flies: bool = False
     fall_tilt: float = float(np.radians(60.0))  # rad, it has fallen when tilted further for long
     footprint: float = 0.3  # m, radius
+    settle: float = 0.0  # s that setting out and coming to rest cost it
     lands: bool = False  # it comes down for a service
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -280,10 +280,13 @@ class Group:
         return Execution(fleet.missions[k], fleet.scenarios[k], make(), fleet.bodies, fleet.frame,
                          seed=self._seed(k), mode=contender.mode, route=route)
 
-    def _by_the_clock(self, contender: Contender, k: int) -> TimedExecution:
+    def _by_the_clock(self, contender: Contender, k: int, settling: bool = True
+                      ) -> TimedExecution:
+        """A mission before its start; without settling, as if ways were all that takes time."""
         fleet = self._fleet
+        bodies = fleet.bodies if settling else [replace(body, settle=0.0) for body in fleet.bodies]
         mission = by_the_clock(fleet.missions[k], "--mode clock")
-        return TimedExecution(mission, fleet.scenarios[k], chooser(contender), fleet.bodies,
+        return TimedExecution(mission, fleet.scenarios[k], chooser(contender), bodies,
                               fleet.frame, self._roads, seed=self._seed(k))
 
     @cached_property
@@ -292,10 +295,10 @@ class Group:
         return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds))
 
     def _promises(self, contender: Contender) -> list[Promise]:
-        """What a planner by the clock expects of each mission at its start."""
+        """What a planner by the clock makes of each mission at its start, ways alone counted."""
         found = []
         for k in range(len(self._fleet.missions)):
-            execution = self._by_the_clock(contender, k)
+            execution = self._by_the_clock(contender, k, settling=False)
             execution.start(self._fleet.starts[k])
             assert execution.question is not None
             execution.planner.act(execution.question)

@@ -101,6 +101,7 @@ class RobotKind:
     control: Callable[[Any, Array, Array, Array, Command, Surface], tuple[Array, Any, Telemetry]]
     max_step: float = math.inf  # m, highest step it takes
     slowing: float = 0.0  # share of its speed lost on max_slope; in proportion to the slope
+    settle: float = 0.0  # s that setting out and coming to rest cost it beside the way
     flies: bool = False
     fall_tilt: float = math.radians(60.0)  # rad of the base from the vertical: fallen
     odometry: Callable[[Floats, Height | None], tuple[float, float] | None] | None = None

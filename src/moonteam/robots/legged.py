@@ -391,6 +391,7 @@ LEGGED = RobotKind(
     init=init,
     control=control,
     max_step=0.16,  # half a leg's reach
+    settle=0.8,
     slowing=0.3,  # from `moonteam evaluate slopes`
     odometry=odometry,
     callsign="strider",

@@ -206,6 +206,6 @@ WHEELED = RobotKind(
     speed=CRUISE_SPEED, footprint=FOOTPRINT, max_slope=MAX_SLOPE, init=init,
     control=control,
     max_step=0.12,  # under a wheel's radius
-    slowing=0.05,  # from `moonteam evaluate slopes`
+    settle=0.6, slowing=0.05,  # from `moonteam evaluate slopes`
     odometry=odometry, callsign="rover", glyph="square", colour="#c9bfb1",
     camera=Camera(distance=2.9, seconds=10.0))
