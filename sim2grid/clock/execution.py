@@ -78,6 +78,7 @@ class TimedExecution:
                            "clock", rules or Rules())
         self.known, self.book = Known(self.asked), Logbook(self.asked)
         self.task = Task(mission, bodies, frame)
+        self.known.speeds = self.task.speeds
         self.roads = self._charted = roads
         self.planner = planner
         self.question: Moment | None = None
@@ -103,8 +104,9 @@ class TimedExecution:
 
     def moment(self) -> Moment:
         """The mission as it stands."""
-        return self.task.moment(self.roads, self.known.xy, self.known.speeds, self.errands,
-                                self.known.mask, self.solved, self.book.time)
+        return self.task.as_it_stands(
+            self.roads, self.known.xy, self.known.speeds, self.errands, self.known.mask,
+            self.solved, self.book.time)
 
     def start(self, qpos: npt.ArrayLike) -> None:
         """Takes the robots' first pose, qpos [nq], and comes to the first decision."""

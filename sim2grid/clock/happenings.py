@@ -91,7 +91,7 @@ class Happenings:
             its.ask("new_target")
         if event.slow is not None:
             robot = self._names.index(event.slow.robot)
-            its.known.speeds[robot] = event.slow.factor * its.asked.bodies[robot].speed
+            its.known.speeds[robot] = event.slow.factor * its.task.speeds[robot]
             its.again(robot)
             its.ask("slowed")
         if event.silent is not None:
