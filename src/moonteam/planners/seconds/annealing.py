@@ -272,11 +272,17 @@ def anneal(work, plan, space, goal, true, now, rest, warm, iterations, seed, mix
             if j == i:
                 continue
             kind = 1
-            if np.random.random() < mix[5]:
-                count = keep(plan, space, count, t)
-                plan.size[t] = 0
             first, stable = min(i, j), max(i, j) + 1
             shift(plan, i, j)
+            if np.random.random() < mix[10]:  # all that follow get their teams anew
+                stable = m
+                for k in range(first, m):
+                    o = plan.order[k]
+                    count = keep(plan, space, count, o)
+                    plan.size[o] = 0
+            elif np.random.random() < mix[5]:
+                count = keep(plan, space, count, t)
+                plan.size[t] = 0
         elif u < mix[1]:  # another team, chosen anew
             count = keep(plan, space, count, t)
             plan.size[t] = 0

@@ -26,8 +26,8 @@ from moonteam.planners.seconds.work import Open, Work, compact, places
 _BLOCK = 200  # moves between the first looks at the clock
 _SLICE = 0.002  # s between later looks
 _LAST = 4e-5  # s a target that it takes to write the plan down
-_HOT, _COLD = 0.04, 0.01  # temperatures at the beginning and the end, in units
-MIX = np.array([0.3, 0.4, 0.6, 0.9, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0])
+_COLD = 0.01  # temperature at the end, in units
+MIX = np.array([0.3, 0.4, 0.6, 0.9, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.15])
 """Chances of the moves, added up, and their measures, see `annealing.anneal`; found by trying."""
 
 
@@ -78,8 +78,8 @@ def steering(work: Work, alpha: float, beta: float) -> tuple[annealing.Goal, flo
     legs = work.between[work.between < NEVER]
     agents = len(work.free)
     unit = float(legs.mean() if legs.size else 0.0) + float(work.service.mean()) + 1.0
-    by_way = alpha * min(0.3, 3.0 / agents) / max(float(work.effort.mean()), 1e-9)
-    goal = annealing.Goal(alpha, beta + by_way, alpha, 100.0 * (alpha + beta))
+    by_way = alpha * min(0.3, 2.0 / agents) / max(float(work.effort.mean()), 1e-9)
+    goal = annealing.Goal(alpha, beta + by_way, 0.5 * alpha, 100.0 * (alpha + beta))
     return goal, unit * (alpha + beta * float(work.effort.mean()))
 
 
@@ -116,6 +116,8 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
     true = annealing.Goal(alpha, beta, 0.0, goal.fine)
     now = first_plan(opened, plan, space, goal)
     result = space.result
+    hot = min(max(100.0 / max(len(plan.order), 1) ** 2, 0.006), 0.3)  # the more, the cooler
+    cold = min(_COLD, 0.5 * hot)
     best = np.array([alpha * result[1] + beta * result[2] + true.fine * result[3], *result[1:]])
     order, team, size = plan.order.copy(), plan.team.copy(), plan.size.copy()
     curve = [(time.perf_counter() - began, float(best[0]))]
@@ -128,7 +130,7 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
         if share >= 1.0 or iterations == 0:
             break
         step = block if iterations is None else min(block, iterations - done)
-        warm = unit * _HOT * (_COLD / _HOT) ** share
+        warm = unit * hot * (cold / hot) ** share
         was = best[0]
         now, rest = annealing.anneal(work, plan, space, goal, true, now, rest, warm, step,
                                      seed + done, MIX, order, team, size, best)
