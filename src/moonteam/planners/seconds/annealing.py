@@ -22,8 +22,6 @@ class Plan(NamedTuple):
     size: Any  # [M] int64 of each target's team; 0: to be chosen
     begin: Any  # [M] int64 ms of start of each target's service
     tail: Any  # [M] int64 ms from there to the end of all that waits for it, ways home included
-    clock: Any  # [M + 1, N] int64 ms at which each agent is free before the i-th service
-    last: Any  # [M + 1, N] int64 its last target, or -1
     sums: Any  # [M + 1, 3] float64 so far: latest end, weighted travel, ms of lateness
 
 
@@ -51,6 +49,26 @@ class Scratch(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def stand(work, plan, first, clock, last):
+    """Fills `last` [N] and `clock` [N]: where agents are before place `first`, since when."""
+    order, team, size, begin, service = plan.order, plan.team, plan.size, plan.begin, work.service
+    left = clock.shape[0]
+    for a in range(left):
+        last[a] = -1
+        clock[a] = work.free[a]
+    for i in range(first - 1, -1, -1):
+        t = order[i]
+        for k in range(size[t]):
+            a = team[t, k]
+            if last[a] < 0:
+                last[a] = t
+                clock[a] = begin[t] + service[t]
+                left -= 1
+        if left == 0:
+            break
+
+
+@njit(cache=True, nogil=True)
 def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     """The cost of the list, or infinity as soon as it will be above `most`.
 
@@ -65,9 +83,7 @@ def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     first_before, before = work.first_before, work.before
     clock, last, trial = space.clock, space.last, space.begin
     m, n = order.shape[0], clock.shape[0]
-    for a in range(n):
-        clock[a] = plan.clock[first, a]
-        last[a] = plan.last[first, a]
+    stand(work, plan, first, clock, last)
     latest, way, over = plan.sums[first, 0], plan.sums[first, 1], plan.sums[first, 2]
     alpha, beta, fine, tail = goal.alpha, goal.beta, goal.fine, plan.tail
     for i in range(first, m):
@@ -118,8 +134,8 @@ def settle(work, plan, space, first):
     """Takes down the schedule just made: the list sorted by start, what is before each place."""
     order, begin, place, team, size = plan.order, plan.begin, plan.place, plan.team, plan.size
     start, between, classes, effort = work.start, work.between, work.classes, work.effort
-    clock, last, sums = plan.clock, plan.last, plan.sums
-    m, n = order.shape[0], clock.shape[1]
+    last, sums = space.last, plan.sums
+    m = order.shape[0]
     low = first
     for i in range(first, m):
         t = order[i]
@@ -131,20 +147,16 @@ def settle(work, plan, space, first):
             j -= 1
         order[j] = t
         low = min(low, j)
+    stand(work, plan, low, space.clock, last)
     for i in range(low, m):
         t = order[i]
         place[t] = i
-        for a in range(n):
-            clock[i + 1, a] = clock[i, a]
-            last[i + 1, a] = last[i, a]
         end = begin[t] + work.service[t]
         way = 0.0
         for k in range(size[t]):
             a = team[t, k]
-            leg = start[a, t] if last[i, a] < 0 else between[classes[a], last[i, a], t]
-            way += effort[a] * leg
-            clock[i + 1, a] = end
-            last[i + 1, a] = t
+            way += effort[a] * (start[a, t] if last[a] < 0 else between[classes[a], last[a], t])
+            last[a] = t
         sums[i + 1, 0] = max(sums[i, 0], float(end))
         sums[i + 1, 1] = sums[i, 1] + way
         sums[i + 1, 2] = sums[i, 2] + max(0, begin[t] - work.late[t])
