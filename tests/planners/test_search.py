@@ -67,6 +67,14 @@ def test_cpsat_agrees_where_it_closes(objective):
     assert closed >= 4
 
 
+def test_cpsat_that_finds_nothing_in_time_returns_its_hint():
+    found = grid.generate(0, num_agents=8, num_targets=30, num_skills=3, max_steps=512)
+    snapshot = Snapshot.start(found)
+    plan = CpSatPlanner(time_limit=0.2).plan(snapshot)
+    assert plan.status == "feasible"
+    assert simulate.replay(snapshot, plan.actions).complete
+
+
 def test_without_ortools_cpsat_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ortools.sat.python.cp_model", None)
     with pytest.raises(InputError, match=r"pip install moonteam\[ortools\]"):

@@ -20,7 +20,7 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.kind import PlannerKind, PlannerOptions
-from moonteam.planners.lns import Weights, best_insertion, improve
+from moonteam.planners.lns import Weights, best_insertion, improve, measure
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search.insertion import coalitions
 from moonteam.planners.search.task import Task, weights
@@ -71,7 +71,7 @@ class CpSatPlanner(RoutePlanner):
             raise InputError("--planner cpsat", f"alpha {alpha} and beta {beta} are too small; "
                              f"they are rounded to {1 / _SCALE}")
         model.minimize(whole[0] * span + whole[1] * moves)
-        self._hint(model, task, arcs)
+        hint = self._hint(model, task, arcs, began + 0.3 * self.time_limit)
         solver = self._cp.CpSolver()
         spent = time.perf_counter() - began
         solver.parameters.max_time_in_seconds = max(0.01, self.time_limit - spent)
@@ -84,7 +84,7 @@ class CpSatPlanner(RoutePlanner):
         if status == self._cp.INFEASIBLE:
             return Answer(None, math.inf, True)
         if status not in (self._cp.OPTIMAL, self._cp.FEASIBLE):
-            return Answer(None, bound, False)
+            return Answer(hint, bound, False)
         routes = np.full(task.start.shape, -1, np.int32)
         for a in range(len(task.start)):
             onward = {i: j for (b, i, j), (_, arc) in arcs.items()
@@ -145,10 +145,14 @@ class CpSatPlanner(RoutePlanner):
         model.add_circuit([(i + 1, j + 1, lit) for (_, i, j), (_, lit) in mine.items()])
         arcs.update(mine)
 
-    def _hint(self, model: Any, task: Task, arcs: dict[Arc, tuple[int, Any]]) -> None:
-        """Starts the solver from a plan of the large-neighbourhood search."""
+    def _hint(self, model: Any, task: Task, arcs: dict[Arc, tuple[int, Any]],
+              until: float) -> IntArray | None:
+        """Starts the solver from a plan of the large-neighbourhood search; returns its routes.
+
+        None where it takes longer than the steps left.
+        """
         goal = Weights.of(self.objective, self.alpha, self.beta, task)
-        events = improve(task, goal, best_insertion(task, goal), 0, 500, None)
+        events = improve(task, goal, best_insertion(task, goal), 0, 500, until)
         routes: IntArray = events.routes(len(task.start))
         used = set()
         for a, route in enumerate(routes.tolist()):
@@ -157,6 +161,7 @@ class CpSatPlanner(RoutePlanner):
             used |= {(a, t, t) for t in range(len(task.targets)) if t not in places}
         for key, (_, literal) in arcs.items():
             model.add_hint(literal, key in used)
+        return routes if measure(task, events)[0] <= task.horizon else None
 
 
 def _planner(options: PlannerOptions) -> CpSatPlanner:

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from moonteam.errors import InputError
-from moonteam.planners.seconds import exact
+from moonteam.planners.seconds import exact, plain
 from moonteam.planners.seconds.base import NEVER, effort, makespan, problems
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.exhaustive import ExhaustivePlanner
 from moonteam.planners.seconds.goal import value
+from moonteam.planners.seconds.work import compact
 
 OBJECTIVES = ("makespan", "effort", "weighted")
 
@@ -53,6 +54,26 @@ def test_every_combination_of_options_agrees_with_everything_tried(instances):
 @pytest.mark.soak
 def test_many_more_agree(instances):
     compare(range(150, 650), instances.instance)
+
+
+def test_the_plain_case_is_solved_the_same_either_way(instances, monkeypatch):
+    """What goes to the search in steps, services folded into ways, and what goes through labels."""
+    nows = []
+    for seed in range(30):
+        now = instances.large(seed, 3, 4 + seed % 3, skills=2, most=1, service=seed % 2)
+        nows.append(replace(now, home=np.zeros_like(now.home)))
+    taken = 0
+    for now in nows:
+        work = compact(now).work
+        taken += plain.fits(work, 1.0, 0.0)
+        for objective in OBJECTIVES:
+            one = judged(now, ExactPlanner(objective, 1.0, 0.3).plan(now))
+            with monkeypatch.context() as patch:
+                patch.setattr(plain, "fits", lambda *_: False)
+                two = judged(now, ExactPlanner(objective, 1.0, 0.3).plan(now))
+            assert (one.status, two.status) == ("optimal", "optimal")
+            assert one.bound == pytest.approx(two.bound, abs=1e-6, rel=0)
+    assert taken > 15
 
 
 def test_stopped_early_it_is_feasible_with_a_valid_bound(instances, monkeypatch):

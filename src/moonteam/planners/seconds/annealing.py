@@ -21,8 +21,7 @@ class Plan(NamedTuple):
     team: Any  # [M, P] int64
     size: Any  # [M] int64 of each target's team; 0: to be chosen
     begin: Any  # [M] int64 ms of start of each target's service
-    clock: Any  # [M + 1, N] int64 ms at which each agent is free before the i-th service
-    last: Any  # [M + 1, N] int64 its last target, or -1
+    tail: Any  # [M] int64 ms from there to the end of all that waits for it, ways home included
     sums: Any  # [M + 1, 3] float64 so far: latest end, weighted travel, ms of lateness
 
 
@@ -50,10 +49,32 @@ class Scratch(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def decode(work, plan, space, goal, first, most, near, noise):
-    """The cost of the list, whose first `first` services are as they were; infinity above `most`.
+def stand(work, plan, first, clock, last):
+    """Fills `last` [N] and `clock` [N]: where agents are before place `first`, since when."""
+    order, team, size, begin, service = plan.order, plan.team, plan.size, plan.begin, work.service
+    left = clock.shape[0]
+    for a in range(left):
+        last[a] = -1
+        clock[a] = work.free[a]
+    for i in range(first - 1, -1, -1):
+        t = order[i]
+        for k in range(size[t]):
+            a = team[t, k]
+            if last[a] < 0:
+                last[a] = t
+                clock[a] = begin[t] + service[t]
+                left -= 1
+        if left == 0:
+            break
 
-    Fills the teams that are to be chosen, `space.begin` of the others, and `space.result`.
+
+@njit(cache=True, nogil=True)
+def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
+    """The cost of the list, or infinity as soon as it will be above `most`.
+
+    Its first `first` services are as they were, and those from place `stable` on but for their
+    times. `rest` is what the cost without the makespan is at least. Fills the teams that are to be
+    chosen, `space.begin` of the others, and `space.result`.
     """
     order, place, team, size, begin = plan.order, plan.place, plan.team, plan.size, plan.begin
     start, between, classes, ready, late = (work.start, work.between, work.classes, work.ready,
@@ -62,12 +83,9 @@ def decode(work, plan, space, goal, first, most, near, noise):
     first_before, before = work.first_before, work.before
     clock, last, trial = space.clock, space.last, space.begin
     m, n = order.shape[0], clock.shape[0]
-    for a in range(n):
-        clock[a] = plan.clock[first, a]
-        last[a] = plan.last[first, a]
+    stand(work, plan, first, clock, last)
     latest, way, over = plan.sums[first, 0], plan.sums[first, 1], plan.sums[first, 2]
-    slope = goal.alpha + goal.soft / np.sqrt(np.sqrt(1.0 * n))
-    beta, fine = goal.beta, goal.fine
+    alpha, beta, fine, tail = goal.alpha, goal.beta, goal.fine, plan.tail
     for i in range(first, m):
         t = order[i]
         if size[t] == 0:
@@ -92,7 +110,9 @@ def decode(work, plan, space, goal, first, most, near, noise):
         latest = max(latest, float(end))
         if when > late[t]:
             over += when - late[t]
-        if slope * latest + beta * way + fine * over > most:
+        onward = when + tail[t] if i >= stable else end + home[team[t, 0], t]
+        last_end = max(latest, float(onward))
+        if alpha * last_end + max(rest, beta * way) + fine * over > most:
             return np.inf
     fourth = 0.0
     for a in range(n):
@@ -114,8 +134,8 @@ def settle(work, plan, space, first):
     """Takes down the schedule just made: the list sorted by start, what is before each place."""
     order, begin, place, team, size = plan.order, plan.begin, plan.place, plan.team, plan.size
     start, between, classes, effort = work.start, work.between, work.classes, work.effort
-    clock, last, sums = plan.clock, plan.last, plan.sums
-    m, n = order.shape[0], clock.shape[1]
+    last, sums = space.last, plan.sums
+    m = order.shape[0]
     low = first
     for i in range(first, m):
         t = order[i]
@@ -127,35 +147,46 @@ def settle(work, plan, space, first):
             j -= 1
         order[j] = t
         low = min(low, j)
+    stand(work, plan, low, space.clock, last)
     for i in range(low, m):
         t = order[i]
         place[t] = i
-        for a in range(n):
-            clock[i + 1, a] = clock[i, a]
-            last[i + 1, a] = last[i, a]
         end = begin[t] + work.service[t]
         way = 0.0
         for k in range(size[t]):
             a = team[t, k]
-            leg = start[a, t] if last[i, a] < 0 else between[classes[a], last[i, a], t]
-            way += effort[a] * leg
-            clock[i + 1, a] = end
-            last[i + 1, a] = t
+            way += effort[a] * (start[a, t] if last[a] < 0 else between[classes[a], last[a], t])
+            last[a] = t
         sums[i + 1, 0] = max(sums[i, 0], float(end))
         sums[i + 1, 1] = sums[i, 1] + way
         sums[i + 1, 2] = sums[i, 2] + max(0, begin[t] - work.late[t])
+    onward = space.last
+    onward[:] = -1
+    for i in range(m - 1, -1, -1):
+        t = order[i]
+        longest = 0
+        for e in range(work.first_then[t], work.first_then[t + 1]):
+            longest = max(longest, plan.tail[work.then[e]])
+        for k in range(size[t]):
+            a = team[t, k]
+            after = onward[a]
+            longest = max(longest, work.home[a, t] if after < 0
+                          else between[classes[a], t, after] + plan.tail[after])
+            onward[a] = t
+        plan.tail[t] = work.service[t] + longest
 
 
 @njit(cache=True, nogil=True)
 def shift(plan, i, j):
     """Takes the target at place i to place j."""
-    t = plan.order[i]
+    order, place = plan.order, plan.place
+    t = order[i]
     step = 1 if j > i else -1
     for k in range(i, j, step):
-        plan.order[k] = plan.order[k + step]
-        plan.place[plan.order[k]] = k
-    plan.order[j] = t
-    plan.place[t] = j
+        order[k] = order[k + step]
+        place[order[k]] = k
+    order[j] = t
+    place[t] = j
 
 
 @njit(cache=True, nogil=True)
@@ -183,27 +214,28 @@ def keep(plan, space, count, t):
 @njit(cache=True, nogil=True)
 def exchange_tails(work, plan, space, p):
     """Two agents take over each other's services from place p on; how many teams it changes."""
-    m = plan.order.shape[0]
+    order, team, size = plan.order, plan.team, plan.size
+    m = order.shape[0]
     n = work.free.shape[0]
     a, b = np.random.randint(n), np.random.randint(n)
     if a == b:
         return 0
     count = 0
     for i in range(p, m):
-        t = plan.order[i]
+        t = order[i]
         at, bt = -1, -1
-        for k in range(plan.size[t]):
-            if plan.team[t, k] == a:
+        for k in range(size[t]):
+            if team[t, k] == a:
                 at = k
-            elif plan.team[t, k] == b:
+            elif team[t, k] == b:
                 bt = k
         if (at < 0) == (bt < 0):
             continue
         spot, other = (at, b) if at >= 0 else (bt, a)
-        if not enough(work, t, plan.team[t], plan.size[t], spot, other):
+        if not enough(work, t, team[t], size[t], spot, other):
             continue
         count = keep(plan, space, count, t)
-        plan.team[t, spot] = other
+        team[t, spot] = other
     return count
 
 
@@ -225,22 +257,24 @@ def replace(work, plan, space, t, count):
 
 
 @njit(cache=True, nogil=True)
-def anneal(work, plan, space, goal, true, now, hot, cold, iterations, seed, mix, best_order,
+def anneal(work, plan, space, goal, true, now, rest, warm, iterations, seed, mix, best_order,
            best_team, best_size, best):
-    """`iterations` moves from temperature `hot` to `cold`, in units of cost.
+    """`iterations` moves at temperature `warm`, in units of cost.
 
-    `now` is the plan's cost; `best` [4] the best one's true cost (then makespan, effort,
-    lateness), kept with its list. Returns the cost that the plan has in the end.
+    `now` is the plan's cost, `rest` the part that is not makespan; returns both as they are in
+    the end. `best` [4] is the best list's true cost, makespan, effort and lateness.
     """
     np.random.seed(seed)
     m = plan.order.shape[0]
-    ratio = (cold / hot) ** (1.0 / max(1, iterations))
-    warm = hot
     for _ in range(iterations):
-        warm *= ratio
         i = np.random.randint(m)
+        if np.random.random() < mix[9]:  # rather one that has little time to spare
+            o = np.random.randint(m)
+            if plan.begin[plan.order[o]] + plan.tail[plan.order[o]] > (
+                    plan.begin[plan.order[i]] + plan.tail[plan.order[i]]):
+                i = o
         t = plan.order[i]
-        first, count, kind, j = i, 0, 0, i
+        first, count, kind, j, stable = i, 0, 0, i, i + 1
         u = np.random.random()
         if u < mix[0]:  # to another place
             low, high = room(work, plan, i)
@@ -250,11 +284,17 @@ def anneal(work, plan, space, goal, true, now, hot, cold, iterations, seed, mix,
             if j == i:
                 continue
             kind = 1
-            if np.random.random() < mix[5]:
+            first, stable = min(i, j), max(i, j) + 1
+            shift(plan, i, j)
+            if np.random.random() < mix[10]:  # all that follow get their teams anew
+                stable = m
+                for k in range(first, m):
+                    o = plan.order[k]
+                    count = keep(plan, space, count, o)
+                    plan.size[o] = 0
+            elif np.random.random() < mix[5]:
                 count = keep(plan, space, count, t)
                 plan.size[t] = 0
-            first = min(i, j)
-            shift(plan, i, j)
         elif u < mix[1]:  # another team, chosen anew
             count = keep(plan, space, count, t)
             plan.size[t] = 0
@@ -262,13 +302,15 @@ def anneal(work, plan, space, goal, true, now, hot, cold, iterations, seed, mix,
             count = replace(work, plan, space, t, count)
         elif u < mix[3]:
             count = exchange_tails(work, plan, space, i)
+            if count > 0:
+                stable = plan.place[space.changed[count - 1]] + 1
         else:  # two targets change their places
             reach = max(2, int(m * mix[4]))
             j = min(m - 1, i + 1 + np.random.randint(reach))
             o = plan.order[j]
             if room(work, plan, i)[1] < j or room(work, plan, j)[0] > i or j == i:
                 continue
-            kind = 2
+            kind, stable = 2, j + 1
             plan.order[i], plan.order[j] = o, t
             plan.place[t], plan.place[o] = j, i
             if np.random.random() < mix[5]:
@@ -279,10 +321,11 @@ def anneal(work, plan, space, goal, true, now, hot, cold, iterations, seed, mix,
         if kind == 0 and count == 0:
             continue
         most = now - warm * np.log(1.0 - np.random.random())
-        cost = decode(work, plan, space, goal, first, most, mix[6] * np.random.random(),
-                      mix[7] * np.random.random())
+        cost = decode(work, plan, space, goal, first, stable, most, rest - mix[8] * warm,
+                      mix[6] * np.random.random(), mix[7] * np.random.random())
         if cost <= most:
             now = cost
+            rest = cost - goal.alpha * space.result[1] - goal.fine * space.result[3]
             settle(work, plan, space, first)
             real = space.result[1] * true.alpha + space.result[2] * true.beta + true.fine * (
                 space.result[3])
@@ -304,4 +347,4 @@ def anneal(work, plan, space, goal, true, now, hot, cold, iterations, seed, mix,
             plan.size[o] = space.old_size[c]
             for k in range(plan.size[o]):
                 plan.team[o, k] = space.old_team[c, k]
-    return now
+    return now, rest

@@ -16,14 +16,6 @@ MANY = 1 << 60
 """ms later than anything."""
 
 
-@njit(cache=True, nogil=True, inline="always")
-def arrival(work, a, t, last, clock):
-    """ms at which agent a can be at target t."""
-    if last[a] < 0:
-        return clock[a] + work.start[a, t]
-    return clock[a] + work.between[work.classes[a], last[a], t]
-
-
 @njit(cache=True, nogil=True)
 def choose(work, t, last, clock, near, noise, team, reach, want):
     """Fills `team` [P] with agents that are at target t early; returns how many, 0 if nobody can.
@@ -31,16 +23,21 @@ def choose(work, t, last, clock, near, noise, team, reach, want):
     Agents are taken by their time of arrival, their way counted `near` times more, and up to
     `noise` ms of luck.
     """
-    n, skills = work.has.shape
+    has, need, start, between, classes = (work.has, work.need, work.start, work.between,
+                                          work.classes)  # looked up once: each look-up is counted
+    either = work.either[t]
+    n, skills = has.shape
     for a in range(n):
         reach[a] = MANY
         for s in range(skills):
-            if work.has[a, s] and work.need[t, s] > 0:
-                when = arrival(work, a, t, last, clock)
-                reach[a] = when + int(near * (when - clock[a]) + noise * np.random.random())
+            if has[a, s] and need[t, s] > 0:
+                leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
+                reach[a] = clock[a] + leg
+                if noise > 0.0 or near > 0.0:
+                    reach[a] += int(near * leg + noise * np.random.random())
                 break
     for s in range(skills):
-        want[s] = work.need[t, s]
+        want[s] = need[t, s]
     size = 0
     while True:
         best, pick = MANY, -1
@@ -48,7 +45,7 @@ def choose(work, t, last, clock, near, noise, team, reach, want):
             if reach[a] < best:
                 useful = False
                 for s in range(skills):
-                    if work.has[a, s] and want[s] > 0:
+                    if has[a, s] and want[s] > 0:
                         useful = True
                         break
                 if useful:
@@ -60,10 +57,10 @@ def choose(work, t, last, clock, near, noise, team, reach, want):
         reach[pick] = MANY
         left = False
         for s in range(skills):
-            if work.has[pick, s]:
+            if has[pick, s]:
                 want[s] -= 1
             left |= want[s] > 0
-        if work.either[t]:
+        if either:
             return size
         if not left:
             return spare(work, t, team, size) if size > 1 and skills > 1 else size
@@ -83,16 +80,17 @@ def spare(work, t, team, size):
 @njit(cache=True, nogil=True)
 def enough(work, t, team, size, without, instead):
     """Whether the team is what target t needs, place `without` taken by agent `instead` or none."""
-    for s in range(work.has.shape[1]):
-        if work.need[t, s] > 0:
+    has, need, either = work.has, work.need, work.either[t]
+    for s in range(has.shape[1]):
+        if need[t, s] > 0:
             number = 0
             for i in range(size):
                 a = instead if i == without else team[i]
-                if a >= 0 and work.has[a, s]:
+                if a >= 0 and has[a, s]:
                     number += 1
-            if work.either[t]:
+            if either:
                 if number > 0:
                     return True
-            elif number < work.need[t, s]:
+            elif number < need[t, s]:
                 return False
-    return not work.either[t]
+    return not either

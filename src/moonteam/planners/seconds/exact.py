@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.planners.seconds import labels
+from moonteam.planners.seconds import labels, plain
 from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, makespan
 from moonteam.planners.seconds.goal import (
     Objective,
@@ -29,6 +29,7 @@ from moonteam.planners.seconds.work import Open, compact
 MAX_TARGETS = 14
 """Open targets that the exact planner takes on: its tables grow as 2^M."""
 
+_PLAIN_TARGETS, _PLAIN_IN_TIME = 12, 8  # that the search in steps gets, without and with a limit
 _CHUNK = 4096  # labels between looks at the clock
 _FIRST_ITERATIONS = 60  # of local search, for each target
 _EPS = 1e-6
@@ -103,8 +104,12 @@ class ExactPlanner:
             raise InputError("--planner exact", f"{agents} agents; the exact planner takes up to "
                              f"{labels.MAX_AGENTS}; use local")
         until = math.inf if self.time_limit is None else began + self.time_limit
-        found = self._first(opened, until)
-        bound, done = self._improve(opened, found, until)
+        found = self._plain(opened)
+        if found is not None:
+            bound, done = found.cost, True
+        else:
+            found = self._first(opened, until)
+            bound, done = self._improve(opened, found, until)
         if found.order:
             services = schedule(opened, found.order, found.teams)
             return answer(self.name, self.objective, moment, services,
@@ -121,6 +126,15 @@ class ExactPlanner:
         cost = alpha * (plan.makespan or 0) + beta * (plan.effort or 0.0)
         return TimedPlan(plan.planner, plan.objective, "optimal", (), plan.makespan, plan.effort,
                          cost, plan.seconds)
+
+    def _plain(self, opened: Open) -> Found | None:
+        """What the search in steps finds, where it serves and ends in time."""
+        alpha, beta = weights(self.objective, self.alpha, self.beta)
+        most = _PLAIN_TARGETS if self.time_limit is None else _PLAIN_IN_TIME
+        if len(opened.targets) > most or not plain.fits(opened.work, alpha, beta):
+            return None
+        best = plain.solve(opened.work, alpha, beta)
+        return None if best is None else Found(*best)
 
     def _first(self, opened: Open, until: float) -> Found:
         """What a short local search finds."""
