@@ -6,7 +6,7 @@ PYTHON ?= $(shell for p in python3 python3.12 python3.11; do \
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test lint check wheel clean
+.PHONY: demo test soak lint check wheel clean
 
 demo: $(STAMP)
 	$(BIN)/moonteam rollout outpost --planner policy --out runs/demo
@@ -14,6 +14,9 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=15
+
+soak: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m soak --durations=15
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

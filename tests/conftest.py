@@ -7,9 +7,19 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "1")
 
 import jax
+import pytest
 
 from moonteam.compilation import enable_cache
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 enable_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def pytest_collection_modifyitems(config, items):
+    """What takes minutes is left out unless it is asked for: `make soak`."""
+    if "soak" in config.getoption("markexpr"):
+        return
+    for item in items:
+        if item.get_closest_marker("soak"):
+            item.add_marker(pytest.mark.skip(reason="takes minutes: make soak"))

@@ -10,11 +10,19 @@ import pytest
 
 import moonteam
 from moonteam import cli, files
+from moonteam.planners import registry as planners
 from moonteam.policies.policy import Policy
 from moonteam.robots import KINDS
 
 TOP = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/python.md")
+
+
+@pytest.fixture(autouse=True)
+def registries(monkeypatch):
+    """What a test registers is forgotten after it."""
+    for registry in (KINDS, planners._REGISTRY):
+        monkeypatch.setattr(registry, "_own", dict(registry._own))
 
 
 def blocks():

@@ -12,13 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.planners.seconds.base import (
-    NEVER,
     Moment,
     Service,
     TimedPlan,
     TimedPlanner,
-    enough,
     makespan,
+    timed_again,
 )
 from sim2grid.clock.errand import HOME, WAIT
 
@@ -66,38 +65,3 @@ def choices(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
         if not moment.solved[target]:
             found[list(team)] = target
     return np.where(moment.present, found, WAIT)
-
-
-def timed_again(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
-                ) -> tuple[Service, ...] | None:
-    """The services of an order, each as soon as its team can be there; None where that is no plan.
-
-    Targets that are solved are left out; what is open and not in it makes it no plan.
-    """
-    at: dict[int, int] = {}
-    free = moment.free.copy()
-    ends = {int(j): int(moment.ends[j]) for j in np.flatnonzero(moment.solved)}
-    services: list[Service] = []
-    for j, team in order:
-        if moment.solved[j]:
-            continue
-        if not all(moment.present[a] for a in team) or not enough(team, j, moment):
-            return None
-        start = int(moment.appears[j])
-        for k in np.flatnonzero(moment.after[j]).tolist():
-            start = max(start, ends.get(k, NEVER))
-        for a in team:
-            way = (moment.start[a, j] if a not in at
-                   else moment.between[moment.classes[a], at[a], j])
-            start = max(start, int(free[a] + way))
-        if start > moment.lapses[j] or start >= NEVER:
-            return None
-        end = start + int(moment.service[j])
-        services.append(Service(j, team, start, end))
-        ends[j] = end
-        for a in team:
-            at[a], free[a] = j, end
-    if len(ends) < len(moment.solved):
-        return None
-    done = tuple(sorted(services, key=lambda one: (one.start, one.end)))
-    return done if makespan(moment, done) <= moment.limit else None

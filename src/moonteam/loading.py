@@ -53,14 +53,23 @@ def load_one(source: str | os.PathLike[str]) -> Mission | Scenario:
 
     Raises InputError, for a problem by the clock too.
     """
+    found = load_any(source)
+    if isinstance(found, Timed):
+        raise InputError(source, "is by the clock; only scenarios in steps can be used here")
+    return found
+
+
+def load_any(source: str | os.PathLike[str]) -> Mission | Scenario | Timed:
+    """A mission, a scenario or a problem by the clock, be it the only one of a set.
+
+    Raises InputError.
+    """
     found = load(source)
     if isinstance(found, list):
         if len(found) > 1:
             raise InputError(source, f"is a set, which holds {len(found)} scenarios; choose one, "
                              f"such as {os.fspath(source)}:0")
         found = found[0]
-    if isinstance(found, Timed):
-        raise InputError(source, "is by the clock; only scenarios in steps can be used here")
     return found
 
 

@@ -19,12 +19,14 @@ def kill_when_saved(out, words, before=""):
     child = subprocess.Popen([sys.executable, "-c", before + MAIN, *words],
                              env=os.environ | {"JAX_PLATFORMS": "cpu"},
                              stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    deadline = time.monotonic() + 300
-    while checkpoints.newest(out / "checkpoints") is None:
-        assert child.poll() is None, child.communicate()[1].decode()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    child.send_signal(signal.SIGKILL)
-    child.communicate()
+    deadline = time.monotonic() + 900  # beside other work compiling takes long
+    try:
+        while checkpoints.newest(out / "checkpoints") is None:
+            assert child.poll() is None, child.communicate()[1].decode()
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
     assert child.returncode == -signal.SIGKILL
     assert not (out / "report.json").exists()

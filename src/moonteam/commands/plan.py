@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import tyro
 
 from moonteam import files, loading
 from moonteam.commands.options import Planning, Printed, Saved
+from moonteam.errors import InputError
 from moonteam.planners.base import Plan, Snapshot
-from moonteam.problem import scenario
+from moonteam.problem import scenario, timed
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
+from moonteam.problem.timed import Timed
 from moonteam.report.progress import busy
 
 
@@ -22,7 +25,11 @@ class Args(Planning, Saved, Printed):
     SCENARIO is a scenario file (.json), one line of a set (set.jsonl:INDEX, counted from 0,
     or set.jsonl:ID), a mission (.yaml), or the name of a bundled set or mission.
 
-    Files in --out: plan.json and plan.png.
+    Missions and problems by the clock (clock: seconds) are planned in seconds: a mission on its
+    ground, with ways at any angle.
+
+    Files in --out: plan.json and plan.png; of a mission in steps planned in seconds, both plans
+    side by side.
 
     Examples:
       moonteam plan scenario.json --objective moves
@@ -30,6 +37,7 @@ class Args(Planning, Saved, Printed):
       moonteam plan assets/testsets/8x40.jsonl:3 --planner lns --time-limit 10
       moonteam plan outpost --objective weighted --alpha 1 --beta 0.05 --json
       moonteam plan outpost --planner policy --decode best-of-16
+      moonteam plan outpost --clock seconds --out runs/plan
     """
 
     scenario: tyro.conf.Positional[str]
@@ -40,6 +48,9 @@ class Args(Planning, Saved, Printed):
     package's, or FILE.py:OBJECT."""
     seed: int = 0
     """Seed of lns and of a policy that samples."""
+    clock: Literal["steps", "seconds"] | None = None
+    """steps: one cell a decision; seconds: a mission on its ground, at any angle, each kind at its
+    own speed. Default: as the file says."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +64,12 @@ class Case:
 
 
 def load_case(name: str) -> Case:
-    """The scenario that the command line names. Raises InputError."""
-    found = loading.load_one(name)
+    """The scenario in steps that the command line names. Raises InputError."""
+    return case_of(loading.load_one(name))
+
+
+def case_of(found: Mission | Scenario) -> Case:
+    """A scenario in steps with its names."""
     if isinstance(found, Mission):
         return Case(found.scenario(), found.name, tuple(r.name for r in found.robots),
                     tuple(found.target_name(j) for j in range(len(found.targets))))
@@ -124,7 +139,15 @@ def _verdict(plan: Plan, alpha: float, beta: float) -> str:
 def run(args: Args) -> int:
     """Plans, prints, and draws; 1 if there is no plan."""
     args.planner_options(args.seed)
-    case = load_case(args.scenario)
+    found = loading.load_any(args.scenario)
+    clock = args.clock or ("steps" if isinstance(found, Scenario) else found.clock)
+    if clock == "seconds":
+        from moonteam.commands import clocked
+
+        return clocked.run(args, timed.of(found) if isinstance(found, Scenario) else found)
+    if isinstance(found, Timed) or (isinstance(found, Mission) and found.clock == "seconds"):
+        raise InputError("--clock steps", f"{args.scenario} is by the clock")
+    case = case_of(found)
     with busy("planning; the first time on a machine it compiles for a minute"):
         plan = make_plan(args, Snapshot.start(case.scenario))
     if args.json:

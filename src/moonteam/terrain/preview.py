@@ -52,7 +52,8 @@ def grid_of(site: Site, cell_m: float) -> tuple[int, int]:
     return width, height
 
 
-def _box(site: Site) -> tuple[float, float, float, float]:
+def box(site: Site) -> tuple[float, float, float, float]:
+    """West, east, south and north border, m."""
     x, y = site.extent
     return (-x, x, -y, y)
 
@@ -64,7 +65,7 @@ def _draw(site: Site, path: Path, title: str, values: np.ndarray, colors: str, *
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     axes = figure.subplots()
     low, high = limits or (float(values.min()), float(values.max()))
-    place: dict[str, Any] = {"origin": "lower", "extent": _box(site)}
+    place: dict[str, Any] = {"origin": "lower", "extent": box(site)}
     shown = axes.imshow(values, cmap=colors, vmin=low, vmax=high, **place)
     if shaded:
         axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, **place)
@@ -83,7 +84,7 @@ def _draw_traversability(site: Site, path: Path, cell_m: float, times: dict[str,
     places = figure.subplots(1, len(times), squeeze=False)[0]
     for axes, kind in zip(places, times, strict=True):
         axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower",
-                    extent=_box(site))
+                    extent=box(site))
         seconds = times[kind]
         half = [n * cell_m / 2 for n in seconds.shape[::-1]]
         open_share = np.isfinite(seconds).mean()
@@ -114,7 +115,7 @@ def draw_travel(site: Site, path: Path, title: str, half: tuple[float, float], s
 
     figure = Figure(figsize=(7.2, 6.2), layout="constrained")
     axes = figure.subplots()
-    axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower", extent=_box(site))
+    axes.imshow(hillshade(site), cmap="gray", vmin=0, vmax=1, origin="lower", extent=box(site))
     x, y = (np.linspace(-h, h, n) for h, n in zip(half, seconds.shape[::-1], strict=True))
     able = np.isfinite(seconds)
     reached = np.ma.masked_invalid(seconds)

@@ -11,7 +11,9 @@ from moonteam.physics.trials.conformance import check
 from moonteam.robots import KINDS
 
 
-@pytest.mark.parametrize("name", KINDS.names())
+@pytest.mark.parametrize("name", [
+    name if name == "wheeled" else pytest.param(name, marks=pytest.mark.soak)
+    for name in KINDS.names()])
 def test_every_registered_kind_conforms(name):
     failed = [(c.name, c.detail) for c in check(KINDS.get(name)) if not c.passed]
     assert failed == []

@@ -13,14 +13,3 @@ def instances():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def pytest_configure(config):
-    config.addinivalue_line("markers", "soak: minutes long; run with -m soak")
-
-
-def pytest_collection_modifyitems(config, items):
-    if "soak" not in config.getoption("markexpr"):
-        for item in items:
-            if item.get_closest_marker("soak"):
-                item.add_marker(pytest.mark.skip(reason="minutes long; run with -m soak"))

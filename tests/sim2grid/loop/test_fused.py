@@ -145,6 +145,7 @@ def test_a_mixed_team_swaps_falls_and_is_lost_alike(crew, backend):
     assert needed.failure == "unsolvable"
 
 
+@pytest.mark.soak
 def test_a_mixed_team_is_late_and_stuck_alike(crew, backend):
     """The robot on its back is only late, three times; what it could not enter is closed."""
     hurried = Rules(timeout_base_s=6.0, timeout_factor=1.5, fall_s=60.0)

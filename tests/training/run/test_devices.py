@@ -48,6 +48,7 @@ def test_four_devices_give_the_same_curve(alone, tmp_path):
     np.testing.assert_allclose(curve(tmp_path / "run"), alone, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.soak
 def test_two_processes_of_two_give_the_same_curve(alone, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -111,6 +111,7 @@ def figures(out):
             for row in metrics.read(out / "metrics.jsonl")]
 
 
+@pytest.mark.soak
 def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pupil, "SCENARIOS", 8)
     monkeypatch.setitem(imitate.PRESETS, "quick", BOTH)

@@ -97,6 +97,7 @@ SMALLER = ("from training.teacher import pupil; pupil.SCENARIOS = 8; "
 PRACTISED = Imitation(families=(SMALL, Family(3, 2, sides=(4, 4), max_steps=24, grounds=3)))
 
 
+@pytest.mark.soak
 def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch):
     monkeypatch.setattr(pupil, "SCENARIOS", 8)
     monkeypatch.setitem(presets.PRESETS, "quick", PRACTISED)

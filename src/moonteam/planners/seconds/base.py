@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -213,3 +214,38 @@ def effort(now: Moment, services: tuple[Service, ...]) -> float:
                    for one, two in itertools.pairwise(mine))
         total += float(now.effort[a]) * way
     return total
+
+
+def timed_again(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
+                ) -> tuple[Service, ...] | None:
+    """The services of an order, each as soon as its team can be there; None where that is no plan.
+
+    Targets that are solved are left out; what is open and not in it makes it no plan.
+    """
+    at: dict[int, int] = {}
+    free = moment.free.copy()
+    ends = {int(j): int(moment.ends[j]) for j in np.flatnonzero(moment.solved)}
+    services: list[Service] = []
+    for j, team in order:
+        if moment.solved[j]:
+            continue
+        if not all(moment.present[a] for a in team) or not enough(team, j, moment):
+            return None
+        start = int(moment.appears[j])
+        for k in np.flatnonzero(moment.after[j]).tolist():
+            start = max(start, ends.get(k, NEVER))
+        for a in team:
+            way = (moment.start[a, j] if a not in at
+                   else moment.between[moment.classes[a], at[a], j])
+            start = max(start, int(free[a] + way))
+        if start > moment.lapses[j] or start >= NEVER:
+            return None
+        end = start + int(moment.service[j])
+        services.append(Service(j, team, start, end))
+        ends[j] = end
+        for a in team:
+            at[a], free[a] = j, end
+    if len(ends) < len(moment.solved):
+        return None
+    done = tuple(sorted(services, key=lambda one: (one.start, one.end)))
+    return done if makespan(moment, done) <= moment.limit else None
