@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.planners.seconds.base import NEVER, Moment, enough
+from moonteam.planners.seconds.base import MS, NEVER, Moment, Service, enough
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.robots.base import CONTROL_PERIOD
@@ -65,6 +65,11 @@ class Chooser(Protocol):
 
     def act(self, moment: Moment) -> npt.NDArray[np.int64]:
         """[R] a target's number, HOME or WAIT, for every robot that is in no service."""
+        ...
+
+
+    def expected(self, moment: Moment) -> Sequence[Service] | None:
+        """The services still to come, as they are planned; None where nothing is."""
         ...
 
 
@@ -165,6 +170,9 @@ class TimedExecution:
         self.question = None
         chosen = np.asarray(choices, np.int64)
         moment, book, known = self.moment(), self.book, self.known
+        if not self.record.decisions:
+            plan = self.planner.expected(moment) or ()
+            self.record.expected |= {one.target: one.end / MS for one in plan}
         self.record.decisions.append(Decision(
             book.decision, book.time, known.snapshot.cells.copy(), chosen.astype(np.int32),
             self.solved.copy()))

@@ -52,7 +52,8 @@ class Args(Planning, Missions, Resumable, Reported):
     """Which baselines stand in the table."""
     mode: tuple[Literal["barrier", "async", "clock"], ...] = ("barrier",)
     """barrier: all robots decide together; async: each when it arrives (closed, oracle); clock: a
-    decision is a target, planned in seconds and driven at any angle (closed, not the policy)."""
+    decision is a target, planned in seconds and driven at any angle (closed; exact in place of
+    the policy)."""
     planner: tuple[str, ...] = ("policy",)
     """Who decides: registered planners (policy, exact, greedy, lns, cpsat, exhaustive,
     another package's), or

@@ -99,6 +99,7 @@ class Record:
     solves: list[Solve] = field(default_factory=list)
     losses: list[Loss] = field(default_factory=list)
     replans: list[tuple[int, ReplanCause]] = field(default_factory=list)
+    expected: dict[int, float] = field(default_factory=dict)  # target: s, by the first plan
     success: bool = False
     failure: FailureCause | None = None
     detail: str = ""  # why it failed, for a person

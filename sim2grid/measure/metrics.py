@@ -77,6 +77,7 @@ class TargetReport(msgspec.Struct, frozen=True):
     time_s: float | None
     robots: tuple[str, ...]
     distance_m: tuple[float, ...]
+    expected_s: float | None = None  # by the clock, when the first plan had it solved
 
 
 class RobotReport(msgspec.Struct, frozen=True):
@@ -133,6 +134,7 @@ class Report(msgspec.Struct, frozen=True):
     replans: dict[str, int]
     targets: tuple[TargetReport, ...]
     robots: tuple[RobotReport, ...]
+    expected_s: float | None = None  # by the clock, what the first plan took in all
 
 
 def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]:
@@ -142,12 +144,14 @@ def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]
     for j, target in enumerate(record.targets):
         solve = solves.get(j)
         rows.append(TargetReport(
-            name=record.target_names[j], at=target.at, skills=target.skills, type=target.type,
+            name=record.target_names[j], at=target.at, skills=target.words(),
+            type="OR" if target.either else "AND",
             solved=solve is not None,
             decision=solve.decision if solve else None,
             time_s=_round(solve.time_s) if solve else None,
             robots=tuple(mission.robots[i].name for i in solve.robots) if solve else (),
-            distance_m=tuple(_round(d) for d in solve.distance_m) if solve else ()))
+            distance_m=tuple(_round(d) for d in solve.distance_m) if solve else (),
+            expected_s=_round(record.expected[j]) if j in record.expected else None))
     return tuple(rows)
 
 
@@ -205,7 +209,8 @@ def make_report(record: Record, mission: Mission, frame: Frame, bases: Sequence[
         backend=backend, seed=seed, seconds=_round(record.seconds()), decisions=decisions,
         moves=sum(r.moves for r in robots), grid_plan=grid_plan, inflation=inflation,
         replans=dict(sorted(Counter(cause for _, cause in record.replans).items())),
-        targets=target_reports(record, mission), robots=robots)
+        targets=target_reports(record, mission), robots=robots,
+        expected_s=_round(max(record.expected.values())) if record.expected else None)
 
 
 def _round(value: float, digits: int = 4) -> float:

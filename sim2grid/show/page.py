@@ -166,8 +166,9 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
         tiles([
             ("targets solved", f"{solved} of {len(report.targets)}"),
             ("mission seconds", round(report.seconds, 1)), ("decisions", report.decisions),
-            ("of the grid plan", grid.makespan if grid else None),
-            ("inflation", report.inflation), ("moves", report.moves),
+            *([("planned seconds", report.expected_s)] if report.expected_s else
+              [("of the grid plan", grid.makespan if grid else None),
+               ("inflation", report.inflation)]), ("moves", report.moves),
             ("causes of new plans", len(replans)),
             ("times real time", (timing or {}).get("real_time_factor"))]),
         "<h2>Video</h2>", video(made, out),
@@ -183,9 +184,10 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
 
 def _targets(report: Report) -> str:
     return table(
-        ["target", "cell", "needs", "solved", "decision", "time s", "by", "distance m"],
+        ["target", "cell", "needs", "solved", "decision", "time s", "planned s", "by",
+         "distance m"],
         [(t.name, f"{t.at[0]}, {t.at[1]}", requirement(t.skills, t.type), t.solved, t.decision,
-          t.time_s, ", ".join(t.robots) or None,
+          t.time_s, t.expected_s, ", ".join(t.robots) or None,
           ", ".join(f"{d:.2f}" for d in t.distance_m) or None) for t in report.targets])
 
 

@@ -53,7 +53,7 @@ def robot_color(index: int) -> Color:
 
 def requirement(target: Target) -> str:
     """A+B for AND, A/B for OR."""
-    return ("+" if target.type == "AND" else "/").join(target.skills)
+    return ("/" if target.either else "+").join(target.words())
 
 
 def hillshade(heights: npt.NDArray, spacing: float) -> npt.NDArray[np.uint8]:

@@ -382,9 +382,13 @@ def chooser(contender: Contender) -> Keeper:
 
 def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],
                backends: Sequence[str] = ("native",)) -> list[Contender]:
-    """All combinations that mean something, each once; `planners` give who decides."""
+    """All combinations that mean something, each once; `planners` give who decides.
+
+    Policies decide in steps: by the clock the exact planner stands in where there are no others.
+    """
     found: dict[str, Contender] = {}
-    exact = Contender("oracle", "barrier", "exact")
+    planners, exact = list(planners), Contender("oracle", "barrier", "exact")
+    by_the_clock = [who for who in planners if who.planner != "policy"] or [exact]
     for loop in loops:
         for mode, backend in itertools.product(
                 modes if loop in ("closed", "oracle") else ("barrier",),
@@ -393,9 +397,8 @@ def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[
                 continue  # it only knows how to decide again, all together
             if loop == "oracle" and mode == "clock":
                 continue  # closed with the exact planner
-            for who in planners if loop != "oracle" else (exact,):
-                if mode == "clock" and who.planner == "policy":
-                    continue  # policies decide in steps
+            who_decides = by_the_clock if mode == "clock" else planners
+            for who in who_decides if loop != "oracle" else [exact]:
                 one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
                 if found.setdefault(one.name, one) != one:
                     raise InputError("--planner", f"two would be called {who.who}; rename one")

@@ -82,6 +82,10 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         "inflation": boot.ratio(decisions, values(
             lambda row: row.report.grid_plan.makespan if row.report.grid_plan else None, won)),
         "slowdown": boot.ratio(seconds, values(lambda row: row.nominal_s, won)),
+        "planned": boot.mean(values(lambda row: row.report.expected_s, won)),
+        "optimum": boot.mean(values(
+            lambda row: row.nominal_s if row.report.expected_s else None, won)),
+        "over_plan": boot.ratio(seconds, values(lambda row: row.report.expected_s, won)),
         "wrong_cell_rate": boot.ratio(values(
             lambda row: sum(robot.wrong_cells for robot in row.report.robots)), sent),
         "timeout_rate": boot.ratio(values(
@@ -136,7 +140,7 @@ def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Co
     """
     found = []
     for (site, site_seed, name), rows in groups.items():
-        for other in _others(by_name[name]):
+        for other in _others(by_name[name], by_name):
             before = {row.number: row for row in groups.get((site, site_seed, other), [])}
             pairs = [(row.report, before[row.number].report) for row in rows
                      if row.number in before]
@@ -157,8 +161,13 @@ def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Co
     return found
 
 
-def _others(one: Contender) -> list[str]:
-    """Names of the contenders that one is held against."""
+def _others(one: Contender, by_name: dict[str, Contender]) -> list[str]:
+    """Names of the contenders that one is held against: by the clock, all those in steps that
+    decide robot by robot.
+    """
+    if one.mode == "clock" and one.backend == "native":
+        return [name for name, other in by_name.items()
+                if (other.loop, other.mode, other.backend) == ("closed", "async", "native")]
     changes = [{"mode": "barrier"}] if one.mode == "async" else []
     changes += [{"backend": "native"}] if one.backend != "native" else []
     return [msgspec.structs.replace(one, **change).name for change in changes]
@@ -219,6 +228,9 @@ def notes(options: dict[str, Any]) -> list[str]:
 
 Table = tuple[list[str], list[list[str]]]
 
+BY_THE_CLOCK = ["site", "planner", "s by ways alone", "s as planned", "s driven",
+                "driven / planned", "driven / ways alone"]
+"""Ways alone: the same planner's makespan where setting out and coming to rest cost nothing."""
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
             "seconds, ratio", "moves, ratio"]
 DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what differs"]
@@ -248,6 +260,11 @@ def tables(report: dict[str, Any]) -> list[Table]:
                   ] if physical else ["-"] * 7
         rows.append(cells)
     found: list[Table] = [(titles, rows)]
+    if clocked := [line for line in report["summary"] if line["mode"] == "clock"]:
+        found.append((BY_THE_CLOCK, [[
+            f"{line['site']} {line['site_seed']}", line["planner"], spread(line, "optimum", 1),
+            spread(line, "planned", 1), spread(line, "seconds", 1), spread(line, "over_plan", 3),
+            spread(line, "slowdown", 3)] for line in clocked]))
     if report["comparisons"]:
         found.append((COMPARED,
                       [[*map(str, row)] for row in compared_rows(report, spread)]))

@@ -86,6 +86,11 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
         """Whether one robot with any of its skills will do."""
         return self.type == "OR" and not self.coalition
 
+    def words(self) -> tuple[str, ...]:
+        """What it asks for: its skills, with their numbers where they are more than one."""
+        return tuple(skill if number == 1 else f"{number} {skill}"
+                     for skill, number in self.needs().items())
+
     def needs(self) -> dict[str, int]:
         """Robots needed of each skill; where `either` holds, any one of them."""
         return self.coalition or dict.fromkeys(self.skills, 1)

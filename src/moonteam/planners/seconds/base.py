@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -94,7 +94,7 @@ class TimedPlan:
 
     def route(self, agent: int) -> list[Service]:
         """The services that one agent takes part in, in order."""
-        return [service for service in self.services if agent in service.agents]
+        return in_order(self.services, agent)
 
 
 class TimedPlanner(Protocol):
@@ -196,18 +196,23 @@ def makespan(now: Moment, services: tuple[Service, ...]) -> int:
     """
     ends = [int(now.ends.max(initial=0))] + [service.end for service in services]
     for a in np.flatnonzero(now.present).tolist():
-        mine = [service for service in services if a in service.agents]
-        last = max(mine, key=lambda service: service.start, default=None)
-        ends.append(int(now.free[a] + now.home_now[a]) if last is None
-                    else last.end + int(now.home[a, last.target]))
+        mine = in_order(services, a)
+        ends.append(int(now.free[a] + now.home_now[a]) if not mine
+                    else mine[-1].end + int(now.home[a, mine[-1].target]))
     return max(ends)
+
+
+def in_order(services: Iterable[Service], agent: int) -> list[Service]:
+    """The services of one agent as it does them; one of no length before what starts with it."""
+    return sorted((one for one in services if agent in one.agents),
+                  key=lambda one: (one.start, one.end))
 
 
 def effort(now: Moment, services: tuple[Service, ...]) -> float:
     """Weighted ms of travel of the team, ways home included."""
     total = 0.0
     for a in np.flatnonzero(now.present).tolist():
-        mine = sorted((s for s in services if a in s.agents), key=lambda service: service.start)
+        mine = in_order(services, a)
         way = int(now.home_now[a]) if not mine else int(
             now.start[a, mine[0].target] + now.home[a, mine[-1].target])
         way += sum(int(now.between[now.classes[a], one.target, two.target])

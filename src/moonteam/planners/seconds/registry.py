@@ -23,7 +23,7 @@ from moonteam.registry import Registry
 _HERE = "moonteam.planners.seconds"
 _REGISTRY: Registry[object] = Registry("planner by the clock", _HERE, object, {
     "exact": f"{_HERE}.exact:ExactPlanner", "greedy": f"{_HERE}.greedy:GreedyPlanner",
-    "lns": f"{_HERE}.local:LocalSearchPlanner", "cpsat": f"{_HERE}.cpsat:CpsatPlanner",
+    "lns": f"{_HERE}.local:LocalSearchPlanner", "cpsat": f"{_HERE}.cpsat:CpSatPlanner",
     "exhaustive": f"{_HERE}.exhaustive:ExhaustivePlanner"})
 
 
