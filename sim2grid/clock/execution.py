@@ -141,8 +141,9 @@ class TimedExecution:
         near = law.near(self.asked.rules, self.asked.frame, xy, places)
         speeds = np.where(holds | (near & ~going), 0.0, known.speeds)
         for i, errand in enumerate(self.errands):
-            if errand.phase == "serving" and self.asked.bodies[i].lands:
-                speeds[i] = -1.0
+            if errand.phase == "serving" and (
+                    self.task.targets[errand.choice].service >= self.asked.bodies[i].lands_for):
+                speeds[i] = -1.0  # it comes down
         return [(np.where(holds[i], xy[i], points[i]), float(speeds[i]), not bool(known.mask[i]))
                 for i in range(len(xy))]
 

@@ -34,7 +34,7 @@ class Body:
     fall_tilt: float = float(np.radians(60.0))  # rad, it has fallen when tilted further for long
     footprint: float = 0.3  # m, radius
     settle: float = 0.0  # s that setting out and coming to rest cost it
-    lands: bool = False  # it comes down for a service
+    lands_for: float = float("inf")  # s of service from which it comes down for it
 
 
 class Route(NamedTuple):

@@ -86,5 +86,5 @@ def prepare(mission: Mission, source: object) -> Prepared:
 def bodies_of(scene: Scene) -> tuple[Body, ...]:
     """The robots of a scene as the executor needs to know them."""
     return tuple(Body(robot.qpos.start, robot.kind.speed, robot.kind.flies, robot.kind.fall_tilt,
-                      robot.kind.footprint, robot.kind.settle)
+                      robot.kind.footprint, robot.kind.settle, robot.kind.lands_for)
                  for robot in scene.robots)

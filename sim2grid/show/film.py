@@ -39,6 +39,7 @@ from sim2grid.show.picture import (
     font,
     requirement,
     robot_color,
+    skills_of,
 )
 
 WIDTH, HEIGHT = 854, 480
@@ -239,7 +240,7 @@ class Film:
         x, y = at
         for i, spec in enumerate(self.mission.robots):
             draw_robot(pen, self.glyphs[i], (x + 7, y + 9), 7, robot_color(i))
-            _shadowed(pen, (x + 20, y), f"{spec.name}  {spec.kind} {''.join(spec.skills)}", 13,
+            _shadowed(pen, (x + 20, y), f"{spec.name}  {spec.kind} {skills_of(spec)}", 13,
                       robot_color(i))
             _shadowed(pen, (x + 20, y + 16), _doing(moment, i), 12,
                       STATES.get(moment.status[i].split(":")[0], INK))
@@ -262,7 +263,7 @@ class Film:
                 (cut, 0, cut + width, CLOSE[1])), (x, y))
             draw_robot(pen, self.glyphs[i], (x + 12, y + 12), 6, color)
             _shadowed(pen, (x + 23, y + 3), spec.name, 12, color)
-            _shadowed(pen, (x + 23, y + 18), f"{spec.kind} {''.join(spec.skills)}", 10, INK)
+            _shadowed(pen, (x + 23, y + 18), f"{spec.kind} {skills_of(spec)}", 10, INK)
             word = moment.status[i]
             state = STATES.get(word.split(":")[0], INK)
             _shadowed(pen, (x + 6, y + CLOSE[1] - 18), word, 12, state)

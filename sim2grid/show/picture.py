@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from moonteam.problem.mission import Target
+from moonteam.problem.mission import Robot, Target
 from moonteam.robots.base import Glyph
 from sim2grid.frame import Frame
 
@@ -49,6 +49,11 @@ def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
 def robot_color(index: int) -> Color:
     """A robot's colour, the same in every picture."""
     return ROBOTS[index % len(ROBOTS)]
+
+
+def skills_of(robot: Robot) -> str:
+    """Its skills: letters side by side, names apart."""
+    return ("" if all(len(skill) == 1 for skill in robot.skills) else " ").join(robot.skills)
 
 
 def requirement(target: Target) -> str:

@@ -15,13 +15,14 @@ import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.planners.base import Planner
 from moonteam.problem import mission as missions
+from sim2grid.clock.execution import TimedExecution
+from sim2grid.clock.prepare import by_the_clock, execution_of
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
 from sim2grid.loop.prepare import Prepared, prepare
 from sim2grid.measure.metrics import GridPlan
-from sim2grid.study.evaluation import Contender, Entry, Row, maker, on_grid
+from sim2grid.study.evaluation import Contender, Entry, Row, chooser, maker, on_grid
 from sim2grid.study.fleet import fleet_of
 
 
@@ -31,9 +32,8 @@ class Staged:
 
     contender: Contender
     prepared: Prepared
-    planner: Planner
-    execution: Execution
-    grid_plan: GridPlan
+    execution: Execution | TimedExecution
+    grid_plan: GridPlan | None  # None by the clock
     row: Row
     width: int
 
@@ -68,6 +68,11 @@ def restage(report: dict[str, Any], number: int, source: object,
                          "--mission")
     row = msgspec.convert(raw, Row)
     mission = missions.check(msgspec.convert(entry, Entry).mission, source)
+    width = min(int(report["options"]["width"]), int(report["options"]["count"]))
+    if chosen.mode == "clock":
+        prepared = prepare(by_the_clock(mission, source), source)
+        timed = execution_of(prepared, chooser(chosen), row.seed)
+        return Staged(chosen, prepared, timed, None, row, width)
     prepared = prepare(mission, source)
     make = maker(chosen)
     fleet = fleet_of([mission], [1], prepared.site, prepared.passable)
@@ -75,12 +80,9 @@ def restage(report: dict[str, Any], number: int, source: object,
     route = None
     if chosen.loop == "open":
         route = on_grid(fleet, make, events=False, seeds=[row.seed])[0].route
-    planner = make()
-    execution = Execution(mission, prepared.scenario, planner, prepared.bodies, prepared.frame,
+    execution = Execution(mission, prepared.scenario, make(), prepared.bodies, prepared.frame,
                           seed=row.seed, mode=chosen.mode, route=route)
-    options = report["options"]
-    width = min(int(options["width"]), int(options["count"]))
-    return Staged(chosen, prepared, planner, execution, grid.plan, row, width)
+    return Staged(chosen, prepared, execution, grid.plan, row, width)
 
 
 def _contender(report: dict[str, Any], name: str | None, source: object) -> Contender:

@@ -106,15 +106,19 @@ def document(case: Case, plan: TimedPlan) -> dict[str, Any]:
         "bound": None if plan.bound is None else plan.bound / MS, "seconds": plan.seconds,
         "schedule": schedule}
     if case.ground is not None and plan.status != "infeasible":
-        out["ways"] = [[{"target": one.target, "points": np.round(points, 3).tolist(),
-                         "leaves": leaves, "arrives": arrives}
+        out["ways"] = [[{"target": None if one is None else one.target,
+                         "points": np.round(points, 3).tolist(), "leaves": leaves,
+                         "arrives": arrives}
                         for one, points, leaves, arrives in ways_of(case, plan, i)]
                        for i in range(len(case.agents))]
     return out | ({"reason": plan.reason} if plan.reason else {})
 
 
 def ways_of(case: Case, plan: TimedPlan, agent: int) -> list[tuple[Any, Floats, float, float]]:
-    """An agent's ways: service, points [P, 2] m, seconds at which it leaves and is there."""
+    """An agent's ways: service, points [P, 2] m, seconds at which it leaves and is there.
+
+    The way home is last, with no service at its end.
+    """
     assert case.ground is not None
     asked, roads = case.ground.asked, case.ground.roads
     at, place, leaves, found = None, asked.starts[agent], 0.0, []
@@ -125,6 +129,11 @@ def ways_of(case: Case, plan: TimedPlan, agent: int) -> list[tuple[Any, Floats, 
                 else case.now.between[case.now.classes[agent], at, one.target])
         found.append((one, way.points, leaves, leaves + int(took) / MS))
         at, place, leaves = one.target, goal, one.end / MS
+    home = asked.homes[agent]
+    if home is not None:
+        took = case.now.home_now[agent] if at is None else case.now.home[agent, at]
+        points = roads.way(asked.kinds[agent], place, home).points
+        found.append((None, points, leaves, leaves + int(took) / MS))
     return found
 
 

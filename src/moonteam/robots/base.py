@@ -103,6 +103,7 @@ class RobotKind:
     slowing: float = 0.0  # share of its speed lost on max_slope; in proportion to the slope
     settle: float = 0.0  # s that setting out and coming to rest cost it beside the way
     flies: bool = False
+    lands_for: float = math.inf  # s of service from which what flies comes down for it
     fall_tilt: float = math.radians(60.0)  # rad of the base from the vertical: fallen
     odometry: Callable[[Floats, Height | None], tuple[float, float] | None] | None = None
     contacts: int = 8  # with ground and boulders that count at once: two a foot or wheel

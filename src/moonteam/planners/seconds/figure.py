@@ -75,8 +75,9 @@ def _bars(axes: Any, panel: Panel, robots: Sequence[str], targets: Sequence[str]
     for i, ways in enumerate(panel.ways):
         colour, row = COLOURS[i % len(COLOURS)], len(robots) - 1 - i
         mine = [one for one in panel.services if i in one.agents]
-        for (_, leaves, arrives), one in zip(ways, mine, strict=True):
+        for _, leaves, arrives in ways:
             axes.barh(row, arrives - leaves, DRIVES, left=leaves, color=colour)
+        for (_, _, arrives), one in zip(ways, mine, strict=False):  # the way home serves nothing
             starts, ends = one.start / MS, one.end / MS
             axes.barh(row, starts - arrives, WAITS, left=arrives, color="0.6")
             axes.barh(row, ends - starts, DRIVES, left=starts, color=colour, alpha=0.45,

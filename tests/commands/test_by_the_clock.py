@@ -1,0 +1,117 @@
+"""plan, rollout and evaluate execution by the clock."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from moonteam.cli import main
+
+TINY = """
+name: tiny
+clock: seconds
+max_seconds: 60
+map: {size: [8, 8], cell_m: 1.0}
+site: {preset: flat, seed: 0}
+robots:
+  - {name: hopper, kind: drone, skills: [eye], start: [1, 1.5], home: [1, 1.5]}
+  - {name: rover, kind: wheeled, skills: [eye, drill], start: [5, 1]}
+targets:
+  - {name: look, at: [5.5, 6], skills: [eye], service: 2}
+  - {name: core, at: [4, 3], skills: [drill], after: [look], service: 1}
+"""
+
+
+def printed(capsys, *words, code=0):
+    assert main([*words, "--json"]) == code
+    return msgspec.json.decode(capsys.readouterr().out)
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    file = tmp_path / "tiny.yaml"
+    file.write_text(TINY)
+    return str(file)
+
+
+def test_a_mission_is_planned_on_its_ground(tiny, capsys, tmp_path):
+    plan = printed(capsys, "plan", tiny, "--out", str(tmp_path / "out"))
+    assert plan["clock"] == "seconds"
+    assert plan["status"] == "optimal"
+    look, core = sorted(plan["schedule"], key=lambda one: one["target"])
+    assert look["end"] - look["start"] == pytest.approx(2)
+    assert core["start"] >= look["end"]
+    home = plan["ways"][0][-1]
+    assert home["target"] is None
+    assert plan["makespan"] == pytest.approx(max(home["arrives"], core["end"]))
+    way = np.array(plan["ways"][0][0]["points"])
+    assert np.allclose(way[0], [-2.5, -2.0])
+    assert (tmp_path / "out" / "plan.png").stat().st_size > 10_000
+    assert main(["plan", tiny]) == 0
+    assert "optimal in seconds on this ground" in capsys.readouterr().out
+
+
+def test_a_mission_in_steps_is_planned_in_seconds_if_asked(capsys):
+    steps = printed(capsys, "plan", "outpost")
+    seconds = printed(capsys, "plan", "outpost", "--clock", "seconds")
+    assert "clock" not in steps
+    assert {one["target"] for one in seconds["schedule"]} == set(range(5))
+    assert seconds["makespan"] == seconds["bound"] or seconds["status"] == "optimal"
+    greedy = printed(capsys, "plan", "outpost", "--clock", "seconds", "--planner", "greedy")
+    assert greedy["makespan"] >= seconds["makespan"]
+
+
+def test_a_problem_by_the_clock_is_planned(capsys):
+    plan = printed(capsys, "plan", "3x5:0", "--clock", "seconds")
+    assert plan["makespan"] == printed(capsys, "plan", "3x5:0")["makespan"]
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (["plan", "TINY", "--planner", "policy"], "decides in steps; by the clock: exact"),
+    (["plan", "TINY", "--clock", "steps"], "is by the clock"),
+    (["plan", "TINY", "--planner", "exakt"], "did you mean exact"),
+    (["rollout", "TINY", "--planner", "policy"], "decides in steps"),
+    (["rollout", "TINY", "--mode", "barrier"], "is by the clock"),
+    (["rollout", "TINY", "--backend", "fused"], "drives in steps"),
+    (["evaluate", "execution", "--mode", "clock", "--lose", "1", "--count", "1"], "at_s")])
+def test_what_cannot_be_is_one_line(words, says, tiny, capsys):
+    assert main([tiny if word == "TINY" else word for word in words]) == 2
+    message = capsys.readouterr().err
+    assert says in message
+    assert message.count("\n") == 1
+
+
+def test_real_robots_do_it_as_planned(tiny, capsys, tmp_path):
+    plan = printed(capsys, "plan", tiny)
+    out = tmp_path / "out"
+    report = printed(capsys, "rollout", tiny, "--backend", "native", "--no-video", "--out",
+                     str(out))
+    assert report["success"]
+    assert report["mode"] == "clock"
+    assert report["expected_s"] == pytest.approx(plan["makespan"], abs=6)  # ways home beside it
+    assert report["seconds"] == pytest.approx(plan["makespan"], rel=0.35)
+    look, core = report["targets"]
+    assert look["time_s"] < core["time_s"]
+    assert look["expected_s"] == pytest.approx(plan["schedule"][0]["end"])
+    again = printed(capsys, "rollout", tiny, "--backend", "native", "--no-video", "--out",
+                    str(out))
+    assert again == report
+
+
+def test_missions_by_the_clock_stand_beside_those_in_steps_and_are_made_again(capsys, tmp_path):
+    out = tmp_path / "out"
+    document = printed(capsys, "evaluate", "execution", "--count", "1", "--targets", "2", "--side",
+                       "10", "--site", "flat", "--planner", "exact", "--mode", "async", "clock",
+                       "--out", str(out))
+    steps, clock = document["rows"]
+    assert clock["contender"] == "closed exact clock"
+    assert clock["report"]["success"]
+    assert clock["nominal_s"] < clock["report"]["expected_s"]
+    assert clock["report"]["seconds"] < steps["report"]["seconds"]
+    assert document["comparisons"][0]["over"] == "closed exact async"
+    report = printed(capsys, "rollout", "--from", str(out / "report.json"), "--mission", "0",
+                     "--contender", "closed exact clock", "--no-video", "--out",
+                     str(tmp_path / "again"))
+    assert report == clock["report"]
+    assert json.loads((out / "report.json").read_text())["summary"][1]["optimum"] > 0
