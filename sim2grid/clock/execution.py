@@ -206,8 +206,7 @@ class TimedExecution:
         self.book.note_losses()
         if errand.phase == "serving":
             self._break(errand.choice)
-        self.errands[robot] = Errand.idle(law.seen(self.known.xy, self.known.xy)[robot],
-                                          self.book.time)
+        self.errands[robot] = Errand.idle(self.known.xy[robot], self.book.time)
         self.ask()
 
     def again(self, robot: int) -> None:

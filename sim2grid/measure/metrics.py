@@ -104,6 +104,9 @@ class RobotReport(msgspec.Struct, frozen=True):
     distance_m: float
     energy_j: float
     propellant_kg: float
+    driving_s: float | None = None  # by the clock: on its ways,
+    slower_s: float | None = None  # of which so much more than the ground says,
+    service_s: float | None = None  # and in services
 
 
 class GridPlan(msgspec.Struct, frozen=True):
@@ -185,7 +188,21 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
         stuck=int(loss is not None and loss.cause == "stuck"),
         distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
         energy_j=_round(float((track.power[1:] * steps).sum())),
-        propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6))
+        propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6),
+        **time_spent(record, robot))
+
+
+def time_spent(record: Record, robot: int) -> dict[str, float | None]:
+    """By the clock, where one robot's time went: driving, slower than expected, in services."""
+    legs = [leg for leg in record.legs if leg.robot == robot and leg.expected_s is not None]
+    if not record.expected:
+        return {}
+    took = [(leg.end_s or leg.start_s) - leg.start_s for leg in legs]
+    slower = [t - leg.expected_s for t, leg in zip(took, legs, strict=True)
+              if leg.ended == "arrived" and leg.expected_s is not None]
+    served = [record.targets[s.target].service for s in record.solves if robot in s.robots]
+    return {"driving_s": _round(sum(took)), "slower_s": _round(sum(slower)),
+            "service_s": _round(sum(served))}
 
 
 def make_report(record: Record, mission: Mission, frame: Frame, bases: Sequence[int], *,

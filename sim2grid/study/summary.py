@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -85,6 +86,8 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         "planned": boot.mean(values(lambda row: row.report.expected_s, won)),
         "optimum": boot.mean(values(
             lambda row: row.nominal_s if row.report.expected_s else None, won)),
+        **{key: boot.mean(values(partial(_a_robot, key=key), won))
+           for key in ("driving_s", "slower_s", "service_s")},
         "over_plan": boot.ratio(seconds, values(lambda row: row.report.expected_s, won)),
         "wrong_cell_rate": boot.ratio(values(
             lambda row: sum(robot.wrong_cells for robot in row.report.robots)), sent),
@@ -109,6 +112,11 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         "replans_by_cause": dict(sorted(causes.items())),
         "intervals": {key: _ends(figure) for key, figure in figures.items()},
     }
+
+
+def _a_robot(row: Row, key: str) -> float | None:
+    """A figure of the robots' reports, in the mean of the robots."""
+    return _mean([getattr(robot, key) for robot in row.report.robots])
 
 
 def legs_sent(robot: RobotReport) -> int:
@@ -231,6 +239,11 @@ Table = tuple[list[str], list[list[str]]]
 BY_THE_CLOCK = ["site", "planner", "s by ways alone", "s as planned", "s driven",
                 "driven / planned", "driven / ways alone"]
 """Ways alone: the same planner's makespan where setting out and coming to rest cost nothing."""
+TIME_SPENT = ["site", "planner", "s of a mission", "a robot drives, by the ground",
+              "slower than that", "in service", "standing", "replans"]
+"""Of the mean robot. Slower: speeding up, coming to rest, making way. Standing: waiting for others,
+or done.
+"""
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
             "seconds, ratio", "moves, ratio"]
 DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what differs"]
@@ -265,6 +278,12 @@ def tables(report: dict[str, Any]) -> list[Table]:
             f"{line['site']} {line['site_seed']}", line["planner"], spread(line, "optimum", 1),
             spread(line, "planned", 1), spread(line, "seconds", 1), spread(line, "over_plan", 3),
             spread(line, "slowdown", 3)] for line in clocked]))
+        found.append((TIME_SPENT, [[
+            f"{line['site']} {line['site_seed']}", line["planner"], spread(line, "seconds", 1),
+            _value(line["driving_s"] - line["slower_s"], 1), spread(line, "slower_s", 1),
+            spread(line, "service_s", 1),
+            _value(line["seconds"] - line["driving_s"] - line["service_s"], 1),
+            _value(line["replans"], 2)] for line in clocked if line["driving_s"] is not None]))
     if report["comparisons"]:
         found.append((COMPARED,
                       [[*map(str, row)] for row in compared_rows(report, spread)]))

@@ -67,6 +67,14 @@ def test_a_problem_by_the_clock_is_planned(capsys):
     assert plan["makespan"] == printed(capsys, "plan", "3x5:0")["makespan"]
 
 
+def test_no_robot_is_faster_than_its_kind(tiny, capsys, tmp_path):
+    file = tmp_path / "fast.yaml"
+    file.write_text(TINY.replace("start: [5, 1]", "start: [5, 1], speed: 3"))
+    assert main(["plan", str(file)]) == 2
+    assert "robots[1].speed: 3 is not allowed; a wheeled robot travels at up to 0.5 m/s" in (
+        capsys.readouterr().err)
+
+
 @pytest.mark.parametrize(("words", "says"), [
     (["plan", "TINY", "--planner", "policy"], "decides in steps; by the clock: exact"),
     (["plan", "TINY", "--clock", "steps"], "is by the clock"),
@@ -91,6 +99,9 @@ def test_real_robots_do_it_as_planned(tiny, capsys, tmp_path):
     assert report["mode"] == "clock"
     assert report["expected_s"] == pytest.approx(plan["makespan"], abs=6)  # ways home beside it
     assert report["seconds"] == pytest.approx(plan["makespan"], rel=0.35)
+    hopper, rover = report["robots"]
+    assert hopper["service_s"] + rover["service_s"] == 3
+    assert 0 < hopper["driving_s"] + hopper["service_s"] <= report["seconds"]
     look, core = report["targets"]
     assert look["time_s"] < core["time_s"]
     assert look["expected_s"] == pytest.approx(plan["schedule"][0]["end"])

@@ -40,6 +40,11 @@ def resolve(mission: Mission, source: object) -> tuple[Mission, Kinds]:
             raise InputError(source, f"{written}: another kind is called {kind.name!r} here", key)
         return kind.name
 
+    for i, robot in enumerate(mission.robots):
+        kind = KINDS.get(beside(robot.kind, source), source, f"robots[{i}].kind")
+        if robot.speed is not None and robot.speed > kind.speed:
+            raise InputError(source, f"{robot.speed:g} is not allowed; a {kind.name} robot travels "
+                             f"at up to {kind.speed:g} m/s", f"robots[{i}].speed")
     robots = tuple(
         msgspec.structs.replace(robot, kind=name_of(robot.kind, f"robots[{i}].kind"))
         for i, robot in enumerate(mission.robots))
