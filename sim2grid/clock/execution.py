@@ -365,9 +365,12 @@ class TimedExecution:
         now, errands = self.book.time, self.errands
         for j in sorted({e.choice for e in errands if e.phase == "serving"}):
             team = [i for i, e in enumerate(errands) if e.phase == "serving" and e.choice == j]
-            apart = [law.metres(self.known.xy[i] - errands[i].place) for i in team]
-            if max(apart) > ASTRAY * self.asked.frame.cell_m:
+            astray = [i for i in team if law.metres(self.known.xy[i] - errands[i].place)
+                      > ASTRAY * self.asked.frame.cell_m]
+            if astray:
                 self._break(j)
+                for i in astray:
+                    self._send(i, j, errands[i].place)
             elif now >= errands[team[0]].until - 1e-6:
                 self._solve(j, team)
         open_ = [j for j in np.flatnonzero(~self.solved).tolist()

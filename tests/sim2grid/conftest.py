@@ -24,8 +24,8 @@ from sim2grid.loop.replan import grid_problem
 class SlidingPoints:
     """A backend of one world; each robot has a free joint only and slides at its speed.
 
-    `faults`: (robot, from second) -> "still", "tilt", "nan", "slow", "leisurely",
-    "diverge" or ("drift", vx, vy).
+    `faults`: (robot, from second; the last one holds) -> "still", "tilt", "nan", "slow",
+    "leisurely", "none", "diverge" or ("drift", vx, vy).
     """
 
     start: np.ndarray  # [R, 2] m
@@ -63,7 +63,7 @@ class SlidingPoints:
     def move(self, pose, robot, command, time):
         goal, speed, lost = command
         active = [what for (i, since), what in self.faults.items() if i == robot and time >= since]
-        what = active[0] if active else None
+        what = active[-1] if active else None
         if what == "still" or lost:
             return
         if what == "tilt":

@@ -47,6 +47,13 @@ def test_a_service_is_stood_through_by_its_whole_coalition(mission, drive):
     assert np.ptp(xy[during], axis=0).max() < 0.25
 
 
+def test_who_drifts_off_breaks_the_service_and_comes_back(mission, drive):
+    spec = mission([ROVER], [{"at": [3, 0], "skills": ["A"], "service": 10}])
+    done = drive(spec, (0, (0,)), faults={(0, 9.0): ("drift", 0.5, 0.0), (0, 11.0): "none"})
+    assert done.record.success
+    assert done.record.solves[0].time_s > 11 + 10
+
+
 def test_nothing_starts_before_it_appears(mission, drive):
     spec = mission([HOPPER], [{"at": [9, 11], "skills": ["C"], "appears": 20, "service": 2}])
     done = drive(spec, (0, (0,)))
