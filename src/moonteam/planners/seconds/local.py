@@ -28,7 +28,7 @@ _SLICE = 0.002  # s between later looks
 _LAST = 4e-5  # s a target that it takes to write the plan down
 _GREEDY = 5e-9  # s that the greedy plan takes, by targets squared and agents
 _COLD = 0.01  # temperature at the end, in units
-MIX = np.array([0.3, 0.4, 0.6, 0.9, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.15])
+MIX = np.array([0.3, 0.4, 0.6, 0.9, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.15, 1.0])
 """Chances of the moves, added up, and their measures, see `annealing.anneal`; found by trying."""
 
 
