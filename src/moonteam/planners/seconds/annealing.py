@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from moonteam.planners.seconds.decode import choose, enough
+from moonteam.planners.seconds.decode import LOOP, choose, enough
 
 
 class Plan(NamedTuple):
@@ -48,7 +48,7 @@ class Scratch(NamedTuple):
     result: Any  # [4] float64: cost, makespan, effort, lateness
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def stand(work, plan, first, clock, last):
     """Fills `last` [N] and `clock` [N]: where agents are before place `first`, since when."""
     order, team, size, begin, service = plan.order, plan.team, plan.size, plan.begin, work.service
@@ -68,7 +68,7 @@ def stand(work, plan, first, clock, last):
             break
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     """The cost of the list, or infinity as soon as it will be above `most`.
 
@@ -130,7 +130,7 @@ def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     return result[0]
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def settle(work, plan, space, first):
     """Takes down the schedule just made: the list sorted by start, what is before each place."""
     order, begin, place, team, size = plan.order, plan.begin, plan.place, plan.team, plan.size
@@ -178,7 +178,7 @@ def settle(work, plan, space, first):
         plan.tail[t] = work.service[t] + longest
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def shift(plan, i, j):
     """Takes the target at place i to place j."""
     order, place = plan.order, plan.place
@@ -191,7 +191,7 @@ def shift(plan, i, j):
     place[t] = j
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def room(work, plan, i):
     """First and last place to which the target at place i can be taken."""
     t = plan.order[i]
@@ -203,7 +203,7 @@ def room(work, plan, i):
     return low, high
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def keep(plan, space, count, t):
     """Remembers the team of target t before it is changed."""
     space.changed[count] = t
@@ -213,7 +213,7 @@ def keep(plan, space, count, t):
     return count + 1
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def exchange_tails(work, plan, space, p):
     """Two agents take over each other's services from place p on; how many teams it changes."""
     order, team, size = plan.order, plan.team, plan.size
@@ -241,7 +241,7 @@ def exchange_tails(work, plan, space, p):
     return count
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def replace(work, plan, space, t, count):
     """Another agent for one of the team of t."""
     n = work.free.shape[0]
@@ -258,7 +258,7 @@ def replace(work, plan, space, t, count):
     return count
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def note(plan, best_order, best_team, best_size):
     """Takes down the list."""
     order, team, size = plan.order, plan.team, plan.size
@@ -270,7 +270,7 @@ def note(plan, best_order, best_team, best_size):
             best_team[t, k] = team[t, k]
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def anneal(work, plan, space, goal, true, now, rest, warm, iterations, seed, mix, best_order,
            best_team, best_size, best):
     """`iterations` moves at temperature `warm`, in units of cost.

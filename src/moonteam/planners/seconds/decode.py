@@ -9,14 +9,18 @@ Legend: N agents, M targets, P places in a team.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
+LOOP: Any = {"cache": True, "nogil": True, "_nrt": False}
+"""Options of inner loops: they make no arrays, and count no references to those they get."""
 MANY = 1 << 60
 """ms later than anything."""
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def choose(work, t, last, clock, when, near, noise, team, reach, want):
     """Fills `team` [P] with agents that are at target t early; returns how many, 0 if nobody can.
 
@@ -63,7 +67,7 @@ def choose(work, t, last, clock, when, near, noise, team, reach, want):
     return size
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def fit(clock, when, team, low, high, reach, able, first, stop):
     """Fills places `low` to `high` of the team with those who are free last but there in time."""
     size = low
@@ -85,7 +89,7 @@ def fit(clock, when, team, low, high, reach, able, first, stop):
     return high
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def gather(work, t, last, clock, when, near, noise, team, reach, want):
     """As `choose`, for agents with several skills."""
     has, need, start, between, classes = (work.has, work.need, work.start, work.between,
@@ -140,7 +144,7 @@ def gather(work, t, last, clock, when, near, noise, team, reach, want):
     return size
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def spare(work, t, team, size):
     """Takes those out of the team who are not needed, the last to come first; returns its size."""
     for i in range(size - 1, -1, -1):
@@ -151,7 +155,7 @@ def spare(work, t, team, size):
     return size
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(**LOOP)
 def enough(work, t, team, size, without, instead):
     """Whether the team is what target t needs, place `without` taken by agent `instead` or none."""
     has, need, either = work.has, work.need, work.either[t]
