@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from moonteam.planners.seconds.decode import choose, enough
+from moonteam.planners.seconds.decode import LOOP, choose, enough
 
 
 class Plan(NamedTuple):
@@ -48,7 +48,7 @@ class Scratch(NamedTuple):
     result: Any  # [4] float64: cost, makespan, effort, lateness
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def stand(work, plan, first, clock, last):
     """Fills `last` [N] and `clock` [N]: where agents are before place `first`, since when."""
     order, team, size, begin, service = plan.order, plan.team, plan.size, plan.begin, work.service
@@ -68,7 +68,7 @@ def stand(work, plan, first, clock, last):
             break
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     """The cost of the list, or infinity as soon as it will be above `most`.
 
@@ -88,14 +88,15 @@ def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     alpha, beta, fine, tail = goal.alpha, goal.beta, goal.fine, plan.tail
     for i in range(first, m):
         t = order[i]
-        if size[t] == 0:
-            size[t] = choose(work, t, last, clock, near, noise, team[t], space.reach, space.want)
-            if size[t] == 0:
-                return np.inf
         when = ready[t]
         for e in range(first_before[t], first_before[t + 1]):
             b = before[e]
             when = max(when, (begin[b] if place[b] < first else trial[b]) + service[b])
+        if size[t] == 0:
+            size[t] = choose(work, t, last, clock, when, near, noise, team[t], space.reach,
+                             space.want)
+            if size[t] == 0:
+                return np.inf
         for k in range(size[t]):
             a = team[t, k]
             leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
@@ -129,7 +130,7 @@ def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     return result[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def settle(work, plan, space, first):
     """Takes down the schedule just made: the list sorted by start, what is before each place."""
     order, begin, place, team, size = plan.order, plan.begin, plan.place, plan.team, plan.size
@@ -161,7 +162,8 @@ def settle(work, plan, space, first):
         sums[i + 1, 1] = sums[i, 1] + way
         sums[i + 1, 2] = sums[i, 2] + max(0, begin[t] - work.late[t])
     onward = space.last
-    onward[:] = -1
+    for a in range(onward.shape[0]):
+        onward[a] = -1
     for i in range(m - 1, -1, -1):
         t = order[i]
         longest = 0
@@ -176,7 +178,7 @@ def settle(work, plan, space, first):
         plan.tail[t] = work.service[t] + longest
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def shift(plan, i, j):
     """Takes the target at place i to place j."""
     order, place = plan.order, plan.place
@@ -189,7 +191,7 @@ def shift(plan, i, j):
     place[t] = j
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def room(work, plan, i):
     """First and last place to which the target at place i can be taken."""
     t = plan.order[i]
@@ -201,7 +203,7 @@ def room(work, plan, i):
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def keep(plan, space, count, t):
     """Remembers the team of target t before it is changed."""
     space.changed[count] = t
@@ -211,7 +213,7 @@ def keep(plan, space, count, t):
     return count + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def exchange_tails(work, plan, space, p):
     """Two agents take over each other's services from place p on; how many teams it changes."""
     order, team, size = plan.order, plan.team, plan.size
@@ -239,7 +241,7 @@ def exchange_tails(work, plan, space, p):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def replace(work, plan, space, t, count):
     """Another agent for one of the team of t."""
     n = work.free.shape[0]
@@ -256,7 +258,19 @@ def replace(work, plan, space, t, count):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
+def note(plan, best_order, best_team, best_size):
+    """Takes down the list."""
+    order, team, size = plan.order, plan.team, plan.size
+    for i in range(order.shape[0]):
+        t = order[i]
+        best_order[i] = t
+        best_size[t] = size[t]
+        for k in range(size[t]):
+            best_team[t, k] = team[t, k]
+
+
+@njit(**LOOP)
 def anneal(work, plan, space, goal, true, now, rest, warm, iterations, seed, mix, best_order,
            best_team, best_size, best):
     """`iterations` moves at temperature `warm`, in units of cost.
@@ -322,7 +336,7 @@ def anneal(work, plan, space, goal, true, now, rest, warm, iterations, seed, mix
             continue
         most = now - warm * np.log(1.0 - np.random.random())
         cost = decode(work, plan, space, goal, first, stable, most, rest - mix[8] * warm,
-                      mix[6] * np.random.random(), mix[7] * np.random.random())
+                      -1.0 if np.random.random() < mix[11] else mix[6] * np.random.random(), 0.0)
         if cost <= most:
             now = cost
             rest = cost - goal.alpha * space.result[1] - goal.fine * space.result[3]
@@ -331,10 +345,9 @@ def anneal(work, plan, space, goal, true, now, rest, warm, iterations, seed, mix
                 space.result[3])
             if real < best[0]:
                 best[0] = real
-                best[1:] = space.result[1:]
-                best_order[:] = plan.order
-                best_team[:] = plan.team
-                best_size[:] = plan.size
+                for k in range(1, 4):
+                    best[k] = space.result[k]
+                note(plan, best_order, best_team, best_size)
             continue
         if kind == 1:
             shift(plan, j, i)

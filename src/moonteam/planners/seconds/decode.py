@@ -9,28 +9,97 @@ Legend: N agents, M targets, P places in a team.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
+LOOP: Any = {"cache": True, "nogil": True, "_nrt": False}
+"""Options of inner loops: they make no arrays, and count no references to those they get."""
 MANY = 1 << 60
 """ms later than anything."""
 
 
-@njit(cache=True, nogil=True)
-def choose(work, t, last, clock, near, noise, team, reach, want):
+@njit(**LOOP)
+def choose(work, t, last, clock, when, near, noise, team, reach, want):
     """Fills `team` [P] with agents that are at target t early; returns how many, 0 if nobody can.
 
     Agents are taken by their time of arrival, their way counted `near` times more, and up to
-    `noise` ms of luck.
+    `noise` ms of luck. With `near` below 0, by their arrival alone, and then those are taken
+    instead who are free last but still there in time: no sooner than `when` the target waits.
     """
+    start, between, classes = work.start, work.between, work.classes
+    first, able = work.first_able, work.able
+    if not work.single:
+        return gather(work, t, last, clock, when, near, noise, team, reach, want)
+    size = 0
+    for e in range(work.first_need[t], work.first_need[t + 1]):
+        s = work.needed[e]
+        low, wanted = size, work.need[t, s]
+        for q in range(first[s], first[s + 1]):
+            a = able[q]
+            leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
+            there = clock[a] + leg
+            if near > 0.0 or noise > 0.0:
+                there += int(near * leg + noise * np.random.random())
+            reach[a] = there
+            k = size
+            if k == low + wanted:
+                if there >= reach[team[k - 1]]:
+                    continue
+                k -= 1
+            else:
+                size += 1
+            while k > low and reach[team[k - 1]] > there:
+                team[k] = team[k - 1]
+                k -= 1
+            team[k] = a
+        if size < low + wanted:
+            return 0
+        if wanted > 0:
+            when = max(when, reach[team[size - 1]])
+    if near < 0.0:
+        low = 0
+        for e in range(work.first_need[t], work.first_need[t + 1]):
+            s = work.needed[e]
+            low = fit(clock, when, team, low, low + work.need[t, s], reach, able, first[s],
+                      first[s + 1])
+    return size
+
+
+@njit(**LOOP)
+def fit(clock, when, team, low, high, reach, able, first, stop):
+    """Fills places `low` to `high` of the team with those who are free last but there in time."""
+    size = low
+    for q in range(first, stop):
+        a = able[q]
+        if reach[a] > when:
+            continue
+        k = size
+        if k == high:
+            if clock[a] <= clock[team[k - 1]]:
+                continue
+            k -= 1
+        else:
+            size += 1
+        while k > low and clock[team[k - 1]] < clock[a]:
+            team[k] = team[k - 1]
+            k -= 1
+        team[k] = a
+    return high
+
+
+@njit(**LOOP)
+def gather(work, t, last, clock, when, near, noise, team, reach, want):
+    """As `choose`, for agents with several skills."""
     has, need, start, between, classes = (work.has, work.need, work.start, work.between,
                                           work.classes)  # looked up once: each look-up is counted
-    either = work.either[t]
+    either, kind = work.either[t], work.kind
     n, skills = has.shape
     for a in range(n):
         reach[a] = MANY
-        for s in range(skills):
-            if has[a, s] and need[t, s] > 0:
+        for e in range(work.first_need[t], work.first_need[t + 1]):
+            if has[a, work.needed[e]]:
                 leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
                 reach[a] = clock[a] + leg
                 if noise > 0.0 or near > 0.0:
@@ -43,30 +112,39 @@ def choose(work, t, last, clock, near, noise, team, reach, want):
         best, pick = MANY, -1
         for a in range(n):
             if reach[a] < best:
-                useful = False
-                for s in range(skills):
+                for e in range(work.first_need[t], work.first_need[t + 1]):
+                    s = work.needed[e]
                     if has[a, s] and want[s] > 0:
-                        useful = True
+                        best, pick = reach[a], a
                         break
-                if useful:
-                    best, pick = reach[a], a
         if pick < 0:
             return 0
         team[size] = pick
         size += 1
+        when = max(when, best)
         reach[pick] = MANY
         left = False
-        for s in range(skills):
+        for e in range(work.first_need[t], work.first_need[t + 1]):
+            s = work.needed[e]
             if has[pick, s]:
                 want[s] -= 1
             left |= want[s] > 0
-        if either:
-            return size
-        if not left:
-            return spare(work, t, team, size) if size > 1 and skills > 1 else size
+        if either or not left:
+            break
+    if size > 1 and work.first_need[t + 1] - work.first_need[t] > 1:
+        size = spare(work, t, team, size)
+    if near < 0.0:
+        for k in range(size):
+            a = team[k]
+            for b in range(n):
+                if kind[b] == kind[a] and reach[b] <= when and clock[b] > clock[team[k]]:
+                    team[k] = b
+            if team[k] != a:
+                reach[team[k]] = MANY
+    return size
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def spare(work, t, team, size):
     """Takes those out of the team who are not needed, the last to come first; returns its size."""
     for i in range(size - 1, -1, -1):
@@ -77,7 +155,7 @@ def spare(work, t, team, size):
     return size
 
 
-@njit(cache=True, nogil=True)
+@njit(**LOOP)
 def enough(work, t, team, size, without, instead):
     """Whether the team is what target t needs, place `without` taken by agent `instead` or none."""
     has, need, either = work.has, work.need, work.either[t]

@@ -30,7 +30,7 @@ def first_done(work, order, team, size):
             if done[t] or waits[t] > 0:
                 continue
             if size[t] == 0:
-                size[t] = choose(work, t, last, clock, 0.0, 0.0, team[t], reach, want)
+                size[t] = choose(work, t, last, clock, 0, 0.0, 0.0, team[t], reach, want)
                 when = ready[t]
                 for k in range(size[t]):
                     a = team[t, k]

@@ -27,8 +27,9 @@ _BLOCK = 200  # moves between the first looks at the clock
 _SLICE = 0.002  # s between later looks
 _LAST = 4e-5  # s a target that it takes to write the plan down
 _GREEDY = 5e-9  # s that the greedy plan takes, by targets squared and agents
+_AGAIN, _SMALL = 300, 16  # moves a target after which small ones start hot again; up to how many
 _COLD = 0.01  # temperature at the end, in units
-MIX = np.array([0.3, 0.4, 0.6, 0.9, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.15])
+MIX = np.array([0.6, 0.65, 0.75, 0.95, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.3, 1.0])
 """Chances of the moves, added up, and their measures, see `annealing.anneal`; found by trying."""
 
 
@@ -124,6 +125,7 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
     order, team, size = plan.order.copy(), plan.team.copy(), plan.size.copy()
     curve = [(time.perf_counter() - began, float(best[0]))]
     done, block, rest = 0, _BLOCK, 0.0
+    again = _AGAIN * len(plan.order) if len(plan.order) <= _SMALL else 0
     while len(order) > 0:
         clock = time.perf_counter()
         share = 0.0 if iterations is None else done / max(iterations, 1)
@@ -132,6 +134,9 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
         if share >= 1.0 or iterations == 0:
             break
         step = block if iterations is None else min(block, iterations - done)
+        if again:  # small ones are cooled down over and over
+            share = done % again / again
+            step = min(step, again - done % again)
         warm = unit * hot * (cold / hot) ** share
         was = best[0]
         now, rest = annealing.anneal(work, plan, space, goal, true, now, rest, warm, step,

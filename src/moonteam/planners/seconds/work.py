@@ -33,6 +33,12 @@ class Work(NamedTuple):
     then: Any  # [E] int64
     free: Any  # [N] int64 ms
     effort: Any  # [N] float64 cost of a ms of travel
+    kind: Any  # [N] int64: agents of a kind have the same skills
+    first_able: Any  # [S + 1] int64: agents with skill s are able[first[s]:first[s + 1]]
+    able: Any  # int64
+    first_need: Any  # [M + 1] int64: as `able`, skills that target j needs
+    needed: Any  # int64
+    single: bool  # no agent has two skills, and no target can do with either of two
     floor: int  # ms: what is under way has ended
     limit: int  # ms
 
@@ -57,16 +63,22 @@ def compact(now: Moment) -> Open:
     first_before, before = _pairs(after)
     first_then, then = _pairs(after.T)
     home = now.home[np.ix_(agents, targets)]
+    has, need = now.has[agents], now.need[targets]
+    first_able, able = _pairs(has.T)
+    first_need, needed = _pairs(need > 0)
     work = Work(
         start=np.ascontiguousarray(now.start[np.ix_(agents, targets)]),
         between=np.ascontiguousarray(now.between[:, targets][:, :, targets]),
         home=np.ascontiguousarray(home), idle_way=now.home_now[agents].copy(),
-        classes=now.classes[agents].copy(), has=np.ascontiguousarray(now.has[agents]),
-        need=np.ascontiguousarray(now.need[targets]), either=now.either[targets].copy(),
+        classes=now.classes[agents].copy(), has=np.ascontiguousarray(has),
+        need=np.ascontiguousarray(need), either=now.either[targets].copy(),
         service=now.service[targets].copy(), ready=ready,
         late=np.minimum(now.lapses[targets], now.limit - now.service[targets]),
         first_before=first_before, before=before, first_then=first_then, then=then,
         free=now.free[agents].copy(), effort=now.effort[agents].astype(np.float64),
+        kind=np.unique(has, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64),
+        first_able=first_able, able=able, first_need=first_need, needed=needed,
+        single=bool((has.sum(axis=1) <= 1).all() and not now.either[targets].any()),
         floor=int(now.ends.max(initial=0)), limit=int(now.limit))
     return Open(work, agents, targets, _hopeless(work, after, targets))
 
