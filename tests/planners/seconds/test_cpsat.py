@@ -9,7 +9,7 @@ from moonteam.errors import InputError
 from moonteam.planners.seconds.base import effort, makespan, problems
 from moonteam.planners.seconds.cpsat import CpSatPlanner
 from moonteam.planners.seconds.exact import ExactPlanner
-from moonteam.planners.seconds.goal import value
+from moonteam.planners.seconds.search.goal import value
 
 pytest.importorskip("ortools")
 OBJECTIVES = ("makespan", "effort", "weighted")

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from moonteam.errors import InputError
-from moonteam.planners.seconds import exact, plain
+from moonteam.planners.seconds import exact
 from moonteam.planners.seconds.base import NEVER, effort, makespan, problems
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.exhaustive import ExhaustivePlanner
-from moonteam.planners.seconds.goal import value
-from moonteam.planners.seconds.work import compact
+from moonteam.planners.seconds.search import plain
+from moonteam.planners.seconds.search.goal import value
+from moonteam.planners.seconds.search.work import compact
 
 OBJECTIVES = ("makespan", "effort", "weighted")
 

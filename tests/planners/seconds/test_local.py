@@ -6,9 +6,9 @@ import pytest
 
 from moonteam.planners.seconds.base import effort, makespan, problems
 from moonteam.planners.seconds.exact import ExactPlanner
-from moonteam.planners.seconds.goal import value
 from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.seconds.local import LocalSearchPlanner
+from moonteam.planners.seconds.search.goal import value
 
 OBJECTIVES = ("makespan", "effort", "weighted")
 

@@ -16,7 +16,8 @@ from typing import Any
 
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, problems
-from moonteam.planners.seconds.goal import (
+from moonteam.planners.seconds.local import Best, search
+from moonteam.planners.seconds.search.goal import (
     Objective,
     answer,
     check,
@@ -24,8 +25,7 @@ from moonteam.planners.seconds.goal import (
     schedule,
     weights,
 )
-from moonteam.planners.seconds.local import Best, search
-from moonteam.planners.seconds.work import Work, compact
+from moonteam.planners.seconds.search.work import Work, compact
 
 _SCALE = 1000  # CP-SAT counts in integers: weights are rounded to thousandths
 _LOCAL = 0.25  # share of the time for the local search

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.planners.seconds import labels, plain
 from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, makespan
-from moonteam.planners.seconds.goal import (
+from moonteam.planners.seconds.local import search
+from moonteam.planners.seconds.search import labels, plain
+from moonteam.planners.seconds.search.goal import (
     Objective,
     answer,
     check,
@@ -23,8 +24,7 @@ from moonteam.planners.seconds.goal import (
     schedule,
     weights,
 )
-from moonteam.planners.seconds.local import search
-from moonteam.planners.seconds.work import Open, compact
+from moonteam.planners.seconds.search.work import Open, compact
 
 MAX_TARGETS = 14
 """Open targets that the exact planner takes on: its tables grow as 2^M."""

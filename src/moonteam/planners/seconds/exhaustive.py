@@ -23,7 +23,7 @@ from moonteam.planners.seconds.base import (
     enough,
     makespan,
 )
-from moonteam.planners.seconds.goal import Objective, check, value
+from moonteam.planners.seconds.search.goal import Objective, check, value
 
 MAX_TARGETS = 6
 

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 
 from moonteam.planners.seconds.base import NEVER, Int64, Moment, TimedPlan, makespan
-from moonteam.planners.seconds.decode import choose
-from moonteam.planners.seconds.goal import answer, infeasible, lists, schedule
-from moonteam.planners.seconds.work import Open, compact, places
+from moonteam.planners.seconds.search.decode import choose
+from moonteam.planners.seconds.search.goal import answer, infeasible, lists, schedule
+from moonteam.planners.seconds.search.work import Open, compact, places
 
 
 @njit(cache=True, nogil=True)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from moonteam.planners.seconds import annealing
 from moonteam.planners.seconds.base import NEVER, Int64, Moment, TimedPlan, makespan
-from moonteam.planners.seconds.goal import (
+from moonteam.planners.seconds.greedy import greedy
+from moonteam.planners.seconds.search import annealing
+from moonteam.planners.seconds.search.goal import (
     Objective,
     answer,
     check,
@@ -20,8 +21,7 @@ from moonteam.planners.seconds.goal import (
     schedule,
     weights,
 )
-from moonteam.planners.seconds.greedy import greedy
-from moonteam.planners.seconds.work import Open, Work, compact, places
+from moonteam.planners.seconds.search.work import Open, Work, compact, places
 
 _BLOCK = 200  # moves between the first looks at the clock
 _SLICE = 0.002  # s between later looks
@@ -146,7 +146,7 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
             curve.append((time.perf_counter() - began, float(best[0])))
         spent = time.perf_counter() - clock
         if iterations is None:
-            block = int(min(max(block * _SLICE / max(spent, 1e-6), 20), 4 * block))
+            block = int(min(max(step * _SLICE / max(spent, 1e-6), 20), 4 * step + 20))
     cost = alpha * best[1] + beta * best[2]
     return Best(cost, float(best[3]), order, team, size, done, curve)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from moonteam.planners.seconds.base import NEVER
-from moonteam.planners.seconds.decode import enough
+from moonteam.planners.seconds.search.decode import enough
 
 MAX_AGENTS = 24
 """Teams are listed by trying all subsets of the agents that are able."""

@@ -14,8 +14,8 @@ from numba import njit
 
 from moonteam.planners.search import schedules
 from moonteam.planners.search.travel import UNREACHABLE
-from moonteam.planners.seconds.labels import shortcut
-from moonteam.planners.seconds.work import Work
+from moonteam.planners.seconds.search.labels import shortcut
+from moonteam.planners.seconds.search.work import Work
 
 _MOST_SKILLS = 8
 _NO_LIMIT = 1 << 62

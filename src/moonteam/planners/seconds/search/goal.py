@@ -10,7 +10,7 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.planners.base import check_objective
 from moonteam.planners.seconds.base import Int64, Moment, Service, TimedPlan, effort, makespan
-from moonteam.planners.seconds.work import Open
+from moonteam.planners.seconds.search.work import Open
 
 Objective = Literal["makespan", "effort", "weighted"]
 

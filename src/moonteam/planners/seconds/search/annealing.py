@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from moonteam.planners.seconds.decode import LOOP, choose, enough
+from moonteam.planners.seconds.search.decode import LOOP, choose, enough
 
 
 class Plan(NamedTuple):
