@@ -24,8 +24,8 @@ from sim2grid.loop.replan import grid_problem
 class SlidingPoints:
     """A backend of one world; each robot has a free joint only and slides at its speed.
 
-    `faults`: (robot, from second; the last one holds) -> "still", "tilt", "nan", "slow",
-    "leisurely", "none", "diverge" or ("drift", vx, vy).
+    `faults`: (robot, from second) -> "still", "tilt", "nan", "slow", "leisurely", "diverge",
+    ("drift", vx, vy), or "none", which ends the others; else the first one given holds.
     """
 
     start: np.ndarray  # [R, 2] m
@@ -63,7 +63,7 @@ class SlidingPoints:
     def move(self, pose, robot, command, time):
         goal, speed, lost = command
         active = [what for (i, since), what in self.faults.items() if i == robot and time >= since]
-        what = active[-1] if active else None
+        what = active[0] if active and "none" not in active else None
         if what == "still" or lost:
             return
         if what == "tilt":
