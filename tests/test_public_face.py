@@ -79,6 +79,16 @@ def test_plan_and_evaluate_say_what_the_commands_say(capsys):
     assert [r["moves"] for r in again["rows"]] == [r["moves"] for r in report["rows"][:6]]
 
 
+def test_plan_follows_the_clock(capsys):
+    for which in ("sampling", "peers/mrta-benchmark:0"):
+        assert cli.main(["plan", which, "--json"]) == 0
+        printed = msgspec.json.decode(capsys.readouterr().out)
+        plan = moonteam.plan(which)
+        assert plan.makespan == round(1000 * printed["makespan"])
+        assert [one.target for one in plan.services] == [
+            one["target"] for one in printed["schedule"]]
+
+
 @pytest.mark.parametrize(("call", "says"), [
     (lambda: moonteam.plan("3x5"), "choose one"),
     (lambda: moonteam.plan("outpost", time_limt=3), "did you mean time_limit"),

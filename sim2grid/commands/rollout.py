@@ -13,10 +13,9 @@ import msgspec
 import numpy.typing as npt
 import tyro
 
-from moonteam import files, paths
+from moonteam import files, loading
 from moonteam.commands.options import Planning, Printed
 from moonteam.errors import InputError
-from moonteam.problem import mission as missions
 from moonteam.problem.mission import Mission
 from moonteam.report import command
 from moonteam.report.command import Aside
@@ -207,7 +206,7 @@ def _from_file(args: Args) -> Run:
     from sim2grid.loop.execution import Execution
     from sim2grid.loop.prepare import prepare
 
-    mission = _load(args.mission)
+    mission, _ = loading.read_mission(args.mission)
     mode = args.mode or ("clock" if mission.clock == "seconds" else "barrier")
     if mode == "clock":
         return _by_the_clock(args, mission)
@@ -260,14 +259,6 @@ def _from_report(args: Args) -> Run:
                row.report.planner, row.report.objective, contender.backend, row.seed,
                f"mission {row.number}, {row.site}: {contender.name}", command_line,
                staged.width, row.slot, row.report)
-
-
-def _load(name: str) -> Mission:
-    """The mission, named after its file where it has no name. Raises InputError."""
-    suffix = ".yml" if name.endswith(".yml") else ".yaml"
-    path = paths.find(name, "missions", suffix)
-    mission = missions.load(path)
-    return msgspec.structs.replace(mission, name=mission.name or path.stem)
 
 
 def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:

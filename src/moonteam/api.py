@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from moonteam import files
+from moonteam import files, loading
 from moonteam.errors import InputError
-from moonteam.loading import load, load_one
+from moonteam.loading import load
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
@@ -26,6 +26,7 @@ from moonteam.problem.timed import Timed
 if TYPE_CHECKING:  # JAX and MuJoCo, which take seconds, are loaded when they are needed
     from moonteam.planners.base import Plan, Planner
     from moonteam.planners.kind import PlannerKind
+    from moonteam.planners.seconds.base import TimedPlan
     from moonteam.robots.base import RobotKind
     from sim2grid.measure.metrics import Report
 
@@ -35,27 +36,34 @@ Named = str | os.PathLike[str]
 T = TypeVar("T")
 
 
-def plan(what: Named | Mission | Scenario, planner: str = "exact", **options: Any) -> Plan:
+def plan(what: Named | Mission | Scenario | Timed, planner: str = "exact", **options: Any
+         ) -> Plan | TimedPlan:
     """One scenario's plan, as `moonteam plan`.
 
     Args:
-      what: a mission or scenario, or what `load` takes for one.
+      what: a mission or scenario, in steps or by the clock, or what `load` takes for one.
       planner: a registered planner, or `FILE.py:OBJECT`.
       **options: fields of `PlannerOptions`, such as objective="moves" or time_limit=1.0.
 
-    Returns the plan: `status`, `makespan` and `moves` in steps, `actions` [T, N], `schedule`.
-    Raises InputError for what cannot be.
+    Returns the plan: `status`, `makespan` and `moves` in steps, `actions` [T, N], `schedule`; by
+    the clock a `TimedPlan`: `makespan` ms, `services`. Raises InputError for what cannot be.
     """
     from moonteam.planners import registry
     from moonteam.planners.base import Snapshot
     from moonteam.planners.kind import PlannerOptions
 
     made = _built(PlannerOptions, "plan", options)
+    found = loading.load_single(what) if isinstance(what, (str, os.PathLike)) else what
+    if isinstance(found, Timed) or (isinstance(found, Mission) and found.clock == "seconds"):
+        from moonteam.commands import clocked
+
+        return clocked.make_plan(planner, made, clocked.case_of(found).now)
     if registry.find(planner).wants_policy:
         from moonteam import compilation
 
         compilation.enable_cache()
-    return registry.make(planner, made).plan(Snapshot.start(_scenario(what)))
+    return registry.make(planner, made).plan(Snapshot.start(
+        found.scenario() if isinstance(found, Mission) else found))
 
 
 def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named | None = None,
@@ -199,8 +207,3 @@ def _built(kind: type[T], call: str, options: dict[str, Any]) -> T:
 def _several(value: Any) -> tuple:
     """The values of an option that may be given several times."""
     return (value,) if isinstance(value, (str, int, float, os.PathLike)) else tuple(value)
-
-
-def _scenario(what: Named | Mission | Scenario) -> Scenario:
-    found = load_one(what) if isinstance(what, (str, os.PathLike)) else what
-    return found.scenario() if isinstance(found, Mission) else found

@@ -53,13 +53,13 @@ def load_one(source: str | os.PathLike[str]) -> Mission | Scenario:
 
     Raises InputError, for a problem by the clock too.
     """
-    found = load_any(source)
+    found = load_single(source)
     if isinstance(found, Timed):
         raise InputError(source, "is by the clock; only scenarios in steps can be used here")
     return found
 
 
-def load_any(source: str | os.PathLike[str]) -> Mission | Scenario | Timed:
+def load_single(source: str | os.PathLike[str]) -> Mission | Scenario | Timed:
     """A mission, a scenario or a problem by the clock, be it the only one of a set.
 
     Raises InputError.
@@ -80,9 +80,18 @@ def load_mission(name: str) -> Mission:
     """
     from moonteam.robots import team
 
+    found, path = read_mission(name)
+    return team.settled(found, path)
+
+
+def read_mission(name: str) -> tuple[Mission, Path]:
+    """The mission as its file has it, named after the file where it has no name, and the file.
+
+    Raises InputError.
+    """
     path = paths.find(name, "missions", ".yml" if name.endswith(".yml") else ".yaml")
-    found = team.settled(missions.load(path), path)
-    return msgspec.structs.replace(found, name=found.name or path.stem)
+    found = missions.load(path)
+    return msgspec.structs.replace(found, name=found.name or path.stem), path
 
 
 def pick(path: Path, which: str) -> Scenario | Timed:

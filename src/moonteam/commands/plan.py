@@ -139,7 +139,7 @@ def _verdict(plan: Plan, alpha: float, beta: float) -> str:
 def run(args: Args) -> int:
     """Plans, prints, and draws; 1 if there is no plan."""
     args.planner_options(args.seed)
-    found = loading.load_any(args.scenario)
+    found = loading.load_single(args.scenario)
     clock = args.clock or ("steps" if isinstance(found, Scenario) else found.clock)
     if clock == "seconds":
         from moonteam.commands import clocked
