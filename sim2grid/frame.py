@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from moonteam.problem import rules
+
 HYSTERESIS = 0.05
 """Fraction of a cell by which a robot must be past a border before its cell changes."""
 
@@ -27,8 +29,7 @@ class Frame:
 
     def centre(self, cells: Any) -> Any:
         """Centres [..., 2] m of cells [..., 2]."""
-        xp = cells.__array_namespace__()
-        return (cells + 0.5 - self._size(xp, cells) / 2) * self.cell_m
+        return rules.centre(cells, self.size, self.cell_m)
 
     def continuous(self, xy: Any) -> Any:
         """Points [..., 2] m in units of cells from the map's lower left corner, [..., 2]."""

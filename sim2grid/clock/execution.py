@@ -67,7 +67,6 @@ class Chooser(Protocol):
         """[R] a target's number, HOME or WAIT, for every robot that is in no service."""
         ...
 
-
     def expected(self, moment: Moment) -> Sequence[Service] | None:
         """The services still to come, as they are planned; None where nothing is."""
         ...
@@ -168,10 +167,10 @@ class TimedExecution:
 
     def answer(self, choices: npt.ArrayLike) -> None:
         """Takes a choice [R] for every robot and sends those that are free to follow it."""
-        self.question = None
+        moment, self.question = self.question, None
         chosen = np.asarray(choices, np.int64)
-        moment, book, known = self.moment(), self.book, self.known
-        if not self.record.decisions:
+        book, known = self.book, self.known
+        if moment is not None and not self.record.decisions:
             plan = self.planner.expected(moment) or ()
             self.record.expected |= {one.target: one.end / MS for one in plan}
         self.record.decisions.append(Decision(
@@ -180,7 +179,7 @@ class TimedExecution:
         heard = known.mask & ~(self._happenings.silent_until > book.time)
         for i, errand in enumerate(self.errands):
             if heard[i] and errand.phase != "serving" and chosen[i] != errand.choice:
-                self._choose(i, int(chosen[i]), moment)
+                self._choose(i, int(chosen[i]))
         book.decision += 1
 
     def diverged(self) -> None:
@@ -245,7 +244,7 @@ class TimedExecution:
                 found.append(j)
         return found
 
-    def _choose(self, robot: int, choice: int, moment: Moment) -> None:
+    def _choose(self, robot: int, choice: int) -> None:
         """Sends a robot on a new errand."""
         home = self.task.homes[robot]
         if choice == WAIT or (choice == HOME and home is None):
@@ -255,7 +254,7 @@ class TimedExecution:
             self.errands[robot].choice = choice
             return
         place = home if choice == HOME else self.task.spot(
-            self.roads, robot, choice, self.task.helpers(moment, choice, robot))
+            self.roads, robot, choice, self.task.helpers(self.known.mask, choice, robot))
         assert place is not None
         self._send(robot, choice, place)
 
@@ -375,15 +374,13 @@ class TimedExecution:
                 self._solve(j, team)
         open_ = [j for j in np.flatnonzero(~self.solved).tolist()
                  if not any(e.phase == "serving" and e.choice == j for e in errands)]
-        moment = None
         for j in open_:
             team = [i for i, e in enumerate(errands) if e.phase == "there" and e.choice == j]
             target = self.task.targets[j]
             if not team or now < target.appears - 1e-6 or (
                     target.lapses is not None and now > target.lapses + 1e-6):
                 continue
-            moment = moment or self.moment()
-            if not enough(team, j, moment) or not all(
+            if not enough(team, j, self.task) or not all(
                     self.solved[k] for k in self.task.after(j)):
                 continue
             for i in team:

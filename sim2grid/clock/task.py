@@ -63,10 +63,10 @@ class Task(OnGround):
         return next((p for p in places if not bool(self._frame.off_map(p, 0.0))
                      and roads.passable(kind, p)), centre)
 
-    def helpers(self, moment: Moment, target: int, robot: int) -> Bools:
-        """[R] robots other than this one that may have to stand at a target with it."""
-        if moment.either[target] or enough((robot,), target, moment):
+    def helpers(self, present: Bools, target: int, robot: int) -> Bools:
+        """[R] those `present` [R] beside this one that may have to stand at a target with it."""
+        if self.either[target] or enough((robot,), target, self):
             return np.zeros(len(self.kinds), bool)
-        useful = (self.has & (moment.need[target] > 0)).any(1) & moment.present
+        useful = (self.has & (self.need[target] > 0)).any(1) & present
         useful[robot] = False
         return useful

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -123,6 +123,24 @@ def read_json(path: str | os.PathLike[str], kind: Any = Any) -> Any:
     except msgspec.DecodeError as error:
         raise InputError(path, f"is not JSON: {error}") from None
     return convert(value, kind, path)
+
+
+def read_lines(path: str | os.PathLike[str], decode: Callable[[str, str], T], what: str
+               ) -> list[T]:
+    """What `decode(line, "line N")` makes of every line of a `.jsonl` file that is not blank.
+
+    Raises InputError if there is none, `what` being what is missing.
+    """
+    found = [decode(line, f"line {n}")
+             for n, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
+    if not found:
+        raise InputError(path, f"holds no {what}; one JSON object a line is needed")
+    return found
+
+
+def write_lines(path: str | os.PathLike[str], values: Iterable[Any]) -> None:
+    """Writes a `.jsonl` file, a value a line, whole or not at all."""
+    write_text(path, "".join(dump_json(value) + "\n" for value in values))
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int = 2) -> None:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from moonteam.planners.seconds.base import MS, NEVER, Bools, Int64, Moment
 from moonteam.problem.mission import Mission, Place, Target
+from moonteam.problem.rules import centre
 
 Floats = npt.NDArray[np.float64]
 
@@ -54,8 +55,7 @@ class OnGround:
 
     def place(self, at: Place) -> Floats:
         """The point [2] m of a place in cells."""
-        grid = self.mission.map
-        return (np.array(at, float) + 0.5 - np.array(grid.size) / 2) * grid.cell_m
+        return centre(np.array(at, float), self.mission.map.size, self.mission.map.cell_m)
 
     def add(self, target: Target) -> None:
         """One more target."""
@@ -72,6 +72,17 @@ class OnGround:
         """[R] m/s: of the kind, or what the mission says where that is less."""
         said = [np.inf if r.speed is None else r.speed for r in self.mission.robots]
         return np.minimum(self._speeds, said)
+
+    @property
+    def need(self) -> Int64:
+        """[M, S] robots wanted of each skill."""
+        return np.array([[t.needs().get(s, 0) for s in self.skills] for t in self.targets],
+                        np.int64).reshape(len(self.targets), len(self.skills))
+
+    @property
+    def either(self) -> Bools:
+        """[M] one robot with any of the skills that are needed."""
+        return np.array([target.either for target in self.targets], bool)
 
     @property
     def points(self) -> Floats:
@@ -121,10 +132,7 @@ class OnGround:
         its = self.targets
         return Moment(
             start=start, between=between, home=home, home_now=home_now,
-            classes=np.arange(robots), has=self.has,
-            need=np.array([[t.needs().get(s, 0) for s in self.skills] for t in its],
-                          np.int64).reshape(count, len(self.skills)),
-            either=np.array([t.either for t in its], bool),
+            classes=np.arange(robots), has=self.has, need=self.need, either=self.either,
             service=ms(np.array([t.service for t in its], float)), after=after,
             appears=ms(np.array([max(0.0, t.appears - now) for t in its])),
             lapses=ms(np.array([np.inf if t.lapses is None else t.lapses - now for t in its])),

@@ -23,6 +23,16 @@ UNREACHABLE = 1 << 20
 """Steps that stand for "no way": more than any way has, and a dozen still add up in int32."""
 
 
+def centre(cells: Any, size: Any, cell_m: float) -> Any:
+    """Points [..., 2] m of places in cells [..., 2], [0, 0] the centre of the lower left one.
+
+    The origin is the middle of the map, which is `size` (W, H) cells of `cell_m` m.
+    """
+    xp = cells.__array_namespace__()
+    # Spelled out to the shape of the cells: ranks are never promoted silently.
+    return (cells + 0.5 - xp.broadcast_to(xp.asarray(size), cells.shape) / 2) * cell_m
+
+
 def enterable(cells: Any, kinds: Any, size: Any, passable: Any) -> Any:
     """[..., N] bool: the cells [..., N, 2] are on the map and open to that agent's kind.
 

@@ -154,13 +154,9 @@ def load_set(path: str | os.PathLike[str]) -> list[Scenario]:
     """A `.jsonl` set (or one `.json` scenario). Raises InputError naming the line."""
     if Path(path).suffix == ".json":
         return [load(path)]
-    lines = files.read_text(path).splitlines()
-    found = [_decode(line, path, f"line {n}") for n, line in enumerate(lines, 1) if line.strip()]
-    if not found:
-        raise InputError(path, "holds no scenario; one JSON object a line is needed")
-    return found
+    return files.read_lines(path, lambda line, where: _decode(line, path, where), "scenario")
 
 
 def save_set(path: str | os.PathLike[str], scenarios: Iterable[Scenario]) -> None:
     """Writes a `.jsonl` set, whole or not at all."""
-    files.write_text(path, "".join(files.dump_json(s) + "\n" for s in scenarios))
+    files.write_lines(path, scenarios)

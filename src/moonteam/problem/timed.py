@@ -197,16 +197,13 @@ def load(path: str | os.PathLike[str]) -> Timed:
 
 def load_set(path: str | os.PathLike[str]) -> list[Timed]:
     """A `.jsonl` set, one problem a line. Raises InputError naming the line."""
-    found = [convert(_decode(line, path, f"line {n}"), path, f"line {n}")
-             for n, line in enumerate(files.read_text(path).splitlines(), 1) if line.strip()]
-    if not found:
-        raise InputError(path, "holds no problem; one JSON object a line is needed")
-    return found
+    return files.read_lines(
+        path, lambda line, where: convert(_decode(line, path, where), path, where), "problem")
 
 
 def save_set(path: str | os.PathLike[str], problems: Iterable[Timed]) -> None:
     """Writes a `.jsonl` set, whole or not at all."""
-    files.write_text(path, "".join(files.dump_json(one) + "\n" for one in problems))
+    files.write_lines(path, problems)
 
 
 def by_the_clock(path: str | os.PathLike[str]) -> bool:

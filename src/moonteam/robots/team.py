@@ -7,7 +7,7 @@ A kind is registered (ours, or an installed package's), or stands in a file besi
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -40,20 +40,13 @@ def resolve(mission: Mission, source: object) -> tuple[Mission, Kinds]:
             raise InputError(source, f"{written}: another kind is called {kind.name!r} here", key)
         return kind.name
 
-    for i, robot in enumerate(mission.robots):
-        kind = KINDS.get(beside(robot.kind, source), source, f"robots[{i}].kind")
-        if robot.speed is not None and robot.speed > kind.speed:
-            raise InputError(source, f"{robot.speed:g} is not allowed; a {kind.name} robot travels "
-                             f"at up to {kind.speed:g} m/s", f"robots[{i}].speed")
-    robots = tuple(
-        msgspec.structs.replace(robot, kind=name_of(robot.kind, f"robots[{i}].kind"))
-        for i, robot in enumerate(mission.robots))
-    events = tuple(
-        event if event.impassable is None else msgspec.structs.replace(
-            event, impassable=msgspec.structs.replace(event.impassable, kind=name_of(
-                event.impassable.kind, f"events[{e}].impassable.kind")))
-        for e, event in enumerate(mission.events))
-    return msgspec.structs.replace(mission, robots=robots, events=events), kinds
+    found = _with_kinds(mission, name_of)
+    for i, robot in enumerate(found.robots):
+        most = kinds[robot.kind].speed
+        if robot.speed is not None and robot.speed > most:
+            raise InputError(source, f"{robot.speed:g} is not allowed; a {robot.kind} robot "
+                             f"travels at up to {most:g} m/s", f"robots[{i}].speed")
+    return found, kinds
 
 
 def settled(mission: Mission, source: object) -> Mission:
@@ -62,18 +55,24 @@ def settled(mission: Mission, source: object) -> Mission:
     """
     resolve(mission, source)
 
-    def full(written: str) -> str:
+    def full(written: str, _: str) -> str:
         found = beside(written, source)
         return found if found == written else str(Path(found).resolve())
 
-    return msgspec.structs.replace(
-        mission,
-        robots=tuple(msgspec.structs.replace(robot, kind=full(robot.kind))
-                     for robot in mission.robots),
-        events=tuple(event if event.impassable is None else msgspec.structs.replace(
-            event, impassable=msgspec.structs.replace(
-                event.impassable, kind=full(event.impassable.kind)))
-            for event in mission.events))
+    return _with_kinds(mission, full)
+
+
+def _with_kinds(mission: Mission, name: Callable[[str, str], str]) -> Mission:
+    """The mission with every kind that it names called `name(as written, key)`."""
+    robots = tuple(
+        msgspec.structs.replace(robot, kind=name(robot.kind, f"robots[{i}].kind"))
+        for i, robot in enumerate(mission.robots))
+    events = tuple(
+        event if event.impassable is None else msgspec.structs.replace(
+            event, impassable=msgspec.structs.replace(event.impassable, kind=name(
+                event.impassable.kind, f"events[{e}].impassable.kind")))
+        for e, event in enumerate(mission.events))
+    return msgspec.structs.replace(mission, robots=robots, events=events)
 
 
 def limits(kinds: Mapping[str, RobotKind]) -> dict[str, Limits]:

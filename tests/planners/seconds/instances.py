@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from moonteam.planners.seconds.base import NEVER, Moment
+from moonteam.planners.seconds.base import NEVER, Moment, effort, makespan, problems
+
+OBJECTIVES = ("makespan", "effort", "weighted")
+
+
+def judged(now, plan):
+    """The plan, if it is what it says."""
+    assert problems(now, plan.services) == []
+    assert (plan.makespan, plan.effort) == (makespan(now, plan.services),
+                                            effort(now, plan.services))
+    return plan
 
 
 class Draw:

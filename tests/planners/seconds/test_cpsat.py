@@ -6,32 +6,23 @@ import time
 import pytest
 
 from moonteam.errors import InputError
-from moonteam.planners.seconds.base import effort, makespan, problems
 from moonteam.planners.seconds.cpsat import CpSatPlanner
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.search.goal import value
 
 pytest.importorskip("ortools")
-OBJECTIVES = ("makespan", "effort", "weighted")
-
-
-def judged(now, plan):
-    assert problems(now, plan.services) == []
-    assert (plan.makespan, plan.effort) == (makespan(now, plan.services),
-                                            effort(now, plan.services))
-    return plan
 
 
 def test_it_agrees_with_the_exact_planner_where_it_closes(instances):
     closed = 0
     for seed in range(40, 70):
         now = instances.instance(seed, 4)
-        goal = (OBJECTIVES[seed % 3], 1.0, 0.3)
+        goal = (instances.OBJECTIVES[seed % 3], 1.0, 0.3)
         wanted = ExactPlanner(*goal).plan(now)
         got = CpSatPlanner(*goal, time_limit=2.0).plan(now)
         assert (got.status == "infeasible") == (wanted.status == "infeasible"), seed
         if wanted.status != "infeasible":
-            cost = value(*goal, judged(now, got).makespan, got.effort)
+            cost = value(*goal, instances.judged(now, got).makespan, got.effort)
             assert got.bound <= wanted.bound + 1e-3
             assert cost >= wanted.bound - 1e-6
             if got.status == "optimal":
@@ -44,7 +35,7 @@ def test_the_limit_is_kept_with_at_least_the_hint(instances):
     now = instances.large(0, 10, 25)
     CpSatPlanner(time_limit=0.1).plan(now)
     began = time.perf_counter()
-    plan = judged(now, CpSatPlanner(time_limit=1.0).plan(now))
+    plan = instances.judged(now, CpSatPlanner(time_limit=1.0).plan(now))
     assert time.perf_counter() - began < 1.5
     assert plan.status == "feasible"
     assert plan.bound <= plan.makespan

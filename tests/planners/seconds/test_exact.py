@@ -7,30 +7,20 @@ import pytest
 
 from moonteam.errors import InputError
 from moonteam.planners.seconds import exact
-from moonteam.planners.seconds.base import NEVER, effort, makespan, problems
+from moonteam.planners.seconds.base import NEVER
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.exhaustive import ExhaustivePlanner
 from moonteam.planners.seconds.search import plain
 from moonteam.planners.seconds.search.goal import value
 from moonteam.planners.seconds.search.work import compact
 
-OBJECTIVES = ("makespan", "effort", "weighted")
 
-
-def judged(now, plan):
-    """The plan, if it is what it says."""
-    assert problems(now, plan.services) == []
-    assert (plan.makespan, plan.effort) == (makespan(now, plan.services),
-                                            effort(now, plan.services))
-    return plan
-
-
-def compare(seeds, instance, most=5):
+def compare(seeds, instances, most=5):
     """Statuses seen; every value must be that of the plain search to the millisecond."""
     seen = []
     for seed in seeds:
-        now = instance(seed, most)
-        for objective in OBJECTIVES:
+        now = instances.instance(seed, most)
+        for objective in instances.OBJECTIVES:
             goal = (objective, 1.0, 0.3)
             wanted, got = ExhaustivePlanner(*goal).plan(now), ExactPlanner(*goal).plan(now)
             assert got.status == wanted.status, f"seed {seed}, {objective}"
@@ -38,7 +28,7 @@ def compare(seeds, instance, most=5):
             if wanted.status == "infeasible":
                 assert got.reason
                 continue
-            judged(now, got)
+            instances.judged(now, got)
             assert value(*goal, got.makespan, got.effort) == pytest.approx(
                 wanted.bound, abs=1e-6, rel=0), f"seed {seed}, {objective}"
             assert got.bound == pytest.approx(wanted.bound, abs=1e-6, rel=0)
@@ -46,15 +36,15 @@ def compare(seeds, instance, most=5):
 
 
 def test_every_combination_of_options_agrees_with_everything_tried(instances):
-    seen = compare(range(100), instances.instance, most=3)
-    seen += compare(range(1000, 1050), instances.instance, most=4)
-    seen += compare(range(2000, 2005), instances.instance, most=5)
+    seen = compare(range(100), instances, most=3)
+    seen += compare(range(1000, 1050), instances, most=4)
+    seen += compare(range(2000, 2005), instances, most=5)
     assert 20 < seen.count("infeasible") < 150
 
 
 @pytest.mark.soak
 def test_many_more_agree(instances):
-    compare(range(150, 650), instances.instance)
+    compare(range(150, 650), instances)
 
 
 def test_the_plain_case_is_solved_the_same_either_way(instances, monkeypatch):
@@ -67,11 +57,11 @@ def test_the_plain_case_is_solved_the_same_either_way(instances, monkeypatch):
     for now in nows:
         work = compact(now).work
         taken += plain.fits(work, 1.0, 0.0)
-        for objective in OBJECTIVES:
-            one = judged(now, ExactPlanner(objective, 1.0, 0.3).plan(now))
+        for objective in instances.OBJECTIVES:
+            one = instances.judged(now, ExactPlanner(objective, 1.0, 0.3).plan(now))
             with monkeypatch.context() as patch:
                 patch.setattr(plain, "fits", lambda *_: False)
-                two = judged(now, ExactPlanner(objective, 1.0, 0.3).plan(now))
+                two = instances.judged(now, ExactPlanner(objective, 1.0, 0.3).plan(now))
             assert (one.status, two.status) == ("optimal", "optimal")
             assert one.bound == pytest.approx(two.bound, abs=1e-6, rel=0)
     assert taken > 15
@@ -82,12 +72,12 @@ def test_stopped_early_it_is_feasible_with_a_valid_bound(instances, monkeypatch)
     seen = set()
     for seed in range(12):
         now = instances.large(seed, 3, 7, skills=2, most=1)
-        for objective in OBJECTIVES:
+        for objective in instances.OBJECTIVES:
             goal = (objective, 1.0, 0.3)
-            best = judged(now, ExactPlanner(*goal).plan(now))
+            best = instances.judged(now, ExactPlanner(*goal).plan(now))
             early = ExactPlanner(*goal, time_limit=1e-9).plan(now)
             seen.add(early.status)
-            judged(now, early)
+            instances.judged(now, early)
             assert best.status == "optimal"
             assert early.bound <= best.bound + 1e-6
             assert value(*goal, early.makespan, early.effort) >= best.bound - 1e-6
@@ -108,7 +98,7 @@ def test_from_the_middle_of_a_plan_what_remains_is_what_it_costs(instances):
         home_now = now.home_now.copy()
         home_now[team] = now.home[team, j]
         rest = replace(now, start=start, free=free, solved=solved, ends=ends, home_now=home_now)
-        again = judged(rest, ExactPlanner().plan(rest))
+        again = instances.judged(rest, ExactPlanner().plan(rest))
         assert again.makespan == plan.makespan
 
 
@@ -131,7 +121,7 @@ def test_reasons_are_named(instances):
 def test_nothing_open_is_an_empty_plan(instances):
     now = instances.large(0, 2, 3, skills=2, most=1)
     done = replace(now, solved=np.ones(3, bool), ends=np.array([5, 9, 2]))
-    plan = judged(done, ExactPlanner().plan(done))
+    plan = instances.judged(done, ExactPlanner().plan(done))
     assert (plan.status, plan.services, plan.makespan) == ("optimal", (), 9)
     assert ExactPlanner().plan(replace(done, limit=8)).status == "infeasible"
 

@@ -4,20 +4,10 @@ import time
 
 import pytest
 
-from moonteam.planners.seconds.base import effort, makespan, problems
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.goal import value
-
-OBJECTIVES = ("makespan", "effort", "weighted")
-
-
-def judged(now, plan):
-    assert problems(now, plan.services) == []
-    assert (plan.makespan, plan.effort) == (makespan(now, plan.services),
-                                            effort(now, plan.services))
-    return plan
 
 
 def test_what_is_found_is_a_plan_and_mostly_the_best_one(instances):
@@ -25,7 +15,7 @@ def test_what_is_found_is_a_plan_and_mostly_the_best_one(instances):
     found = missed = best = 0
     for seed in range(60):
         now = instances.instance(seed)
-        for objective in OBJECTIVES:
+        for objective in instances.OBJECTIVES:
             goal = (objective, 1.0, 0.3)
             wanted = ExactPlanner(*goal).plan(now)
             got = LocalSearchPlanner(*goal, iterations=2000).plan(now)
@@ -33,7 +23,7 @@ def test_what_is_found_is_a_plan_and_mostly_the_best_one(instances):
                 missed += wanted.status != "infeasible"
                 continue
             found += 1
-            cost = value(*goal, judged(now, got).makespan, got.effort)
+            cost = value(*goal, instances.judged(now, got).makespan, got.effort)
             assert cost >= wanted.bound - 1e-6
             best += cost <= wanted.bound * 1.001 + 1e-6
     assert found > 100
@@ -45,8 +35,8 @@ def test_greedy_is_a_plan_and_the_floor(instances):
     floor = better = 0
     for seed in range(6):
         now = instances.large(seed, 10, 30, skills=2, most=3)
-        greedy = judged(now, GreedyPlanner().plan(now))
-        local = judged(now, LocalSearchPlanner(iterations=5000).plan(now))
+        greedy = instances.judged(now, GreedyPlanner().plan(now))
+        local = instances.judged(now, LocalSearchPlanner(iterations=5000).plan(now))
         floor, better = floor + greedy.makespan, better + local.makespan
     assert better < 0.9 * floor
 
@@ -65,7 +55,7 @@ def test_a_time_limit_is_kept_and_the_curve_falls(instances, limit):
     LocalSearchPlanner(iterations=10).plan(now)  # compiled
     planner = LocalSearchPlanner(time_limit=limit)
     began = time.perf_counter()
-    plan = judged(now, planner.plan(now))
+    plan = instances.judged(now, planner.plan(now))
     assert time.perf_counter() - began < limit + 0.2
     seconds, costs = zip(*planner.curve, strict=True)
     assert list(seconds) == sorted(seconds)
@@ -79,6 +69,6 @@ def test_fifty_agents_and_five_hundred_targets(instances):
     now = instances.large(3, 50, 500)
     LocalSearchPlanner(iterations=10).plan(now)
     began = time.perf_counter()
-    plan = judged(now, LocalSearchPlanner(time_limit=1.0).plan(now))
+    plan = instances.judged(now, LocalSearchPlanner(time_limit=1.0).plan(now))
     assert time.perf_counter() - began < 1.5
     assert plan.makespan <= GreedyPlanner().plan(now).makespan

@@ -145,7 +145,26 @@ def moment(timed: Timed) -> Moment:
         limit=NEVER if timed.max_seconds is None else round(MS * timed.max_seconds))
 
 
-def enough(team: tuple[int, ...] | list[int], target: int, now: Moment) -> bool:
+class Needs(Protocol):
+    """Who has and what needs which skills, as in `Moment`."""
+
+    @property
+    def has(self) -> Bools:
+        """[N, S]."""
+        ...
+
+    @property
+    def need(self) -> Int64:
+        """[M, S]."""
+        ...
+
+    @property
+    def either(self) -> Bools:
+        """[M]."""
+        ...
+
+
+def enough(team: tuple[int, ...] | list[int], target: int, now: Needs) -> bool:
     """Whether these agents together are what the target needs."""
     number = now.has[list(team)].sum(0)
     need = now.need[target]

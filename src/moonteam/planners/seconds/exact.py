@@ -81,6 +81,7 @@ class ExactPlanner:
     """
 
     name = "exact"
+    most_targets = MAX_TARGETS
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
                  time_limit: float | None = None):
@@ -95,14 +96,14 @@ class ExactPlanner:
         agents, count = opened.work.start.shape
         if count > MAX_TARGETS:
             raise InputError("--planner exact", f"{count} targets are open; the exact planner "
-                             f"takes up to {MAX_TARGETS}; use local")
+                             f"takes up to {MAX_TARGETS}; use lns")
         if opened.reason:
             return infeasible(self.name, self.objective, opened.reason, began)
         if not count:
             return self._empty(moment, began)
         if agents > labels.MAX_AGENTS:
             raise InputError("--planner exact", f"{agents} agents; the exact planner takes up to "
-                             f"{labels.MAX_AGENTS}; use local")
+                             f"{labels.MAX_AGENTS}; use lns")
         until = math.inf if self.time_limit is None else began + self.time_limit
         found = self._plain(opened)
         if found is not None:

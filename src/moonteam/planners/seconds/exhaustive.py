@@ -98,6 +98,7 @@ class ExhaustivePlanner:
     """
 
     name = "exhaustive"
+    most_targets = MAX_TARGETS
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05):
         self.objective: Objective = check(objective, alpha, beta)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from moonteam.errors import InputError
 from moonteam.problem.mission import Mission
+from moonteam.problem.rules import centre
 from moonteam.terrain.site import Site
 from moonteam.terrain.travel.field import REACH, look_ups, renew, solve
 from moonteam.terrain.travel.lines import at
@@ -186,8 +187,7 @@ class Roads:
 
     def centre(self, cell: tuple[int, int]) -> Place:
         """The centre (x, y) m of a cell (x, y) of the map."""
-        x, y = ((c + 0.5 - n / 2) * self.raster.cell_m
-                for c, n in zip(cell, self.raster.size, strict=True))
+        x, y = centre(np.array(cell, float), self.raster.size, self.raster.cell_m).tolist()
         return x, y
 
     @property
