@@ -104,6 +104,24 @@ def test_policies_on_sets_one_row_each(capsys, policy, tmp_path):
     assert main(["evaluate", "sets", "nowhere", "--policy", policy]) == 2
 
 
+def test_planners_on_sets_beside_a_policy(capsys, tmp_path):
+    words = ["evaluate", "sets", "3x5", "2x3", "--limit", "3", "--planner", "exact", "--planner",
+             "lns", "--time-limit", "0.05"]
+    document = output(capsys, *words, "--json", "--out", str(tmp_path / "run"))
+    assert [row["planner"] for row in document["summary"]] == [
+        "3x5, exact", "3x5, lns", "2x3, exact", "2x3, lns"]
+    exact = document["summary"][0]
+    assert exact["makespan_gap"] == exact["moves_gap_effort"] == 0.0
+    assert exact["success_best"] is None
+    assert (tmp_path / "run" / "summary.csv").read_text().count("\n") == 5
+    assert main([*words, "--markdown"]) == 0
+    assert "| 2x3, lns | 1.000" in capsys.readouterr().out
+    for bad, said in ((["--planner", "exact", "5x20"], "takes up to 12 targets; 5x20 has 20"),
+                      (["--planner", "exact", "--policy", "any_team", "3x5"], "has no effect")):
+        assert main(["evaluate", "sets", *bad]) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_policies_stand_beside_planners(capsys, policy, tmp_path):
     lines = [line for line in GOLDEN.read_text().splitlines() if '"3r5t' in line][:4]
     small = tmp_path / "small.jsonl"

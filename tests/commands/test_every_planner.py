@@ -11,6 +11,7 @@ MINE = "examples/nearest_planner.py:NearestPlanner"
 @pytest.mark.parametrize("words", [
     ["plan", "3x5:0"],
     ["evaluate", "grid", "3x5", "--limit", "2", "--planner", "greedy"],
+    ["evaluate", "sets", "3x5", "--limit", "2", "--planner", "greedy"],
     ["evaluate", "replanning", "--count", "2", "--planner", "greedy"],
     ["evaluate", "timing", "--targets", "3", "--count", "2", "--budget", "0.2"],
     ["evaluate", "execution", "--count", "1", "--targets", "1", "--side", "8", "--loop", "closed",
