@@ -1,0 +1,72 @@
+"""The macro world's data.
+
+Legend of shapes: N agents, M targets, S skills; any leading batch axes come from vmap. Times are
+float32 seconds (or whatever unit the tables are in). Arrays may be padded: `agent_mask` and
+`target_mask` are True where an entry is real.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+from jax import Array
+
+FAR = 1.0e9
+"""s that stand for "no way" and "no limit"."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MacroProblem:
+    """What does not change within an episode; the same as `planners.seconds.base.Moment` says."""
+
+    start: Array  # [N, M] s from where each agent starts to each target; FAR: no way
+    between: Array  # [N, M, M] s from target to target, by each agent
+    home: Array  # [N, M] s from each target to the agent's home; 0 where it has none
+    home_now: Array  # [N] s from where the agent starts to its home; 0 where it has none
+    has: Array  # [N, S] bool
+    need: Array  # [M, S] int32 agents wanted of each skill
+    either: Array  # [M] bool, OR: one agent with any of the skills that are needed
+    service: Array  # [M] s that a coalition stays
+    after: Array  # [M, M] bool, after[j, k]: j starts when k has ended
+    appears: Array  # [M] s before which j does not start
+    shown: Array  # [M] s before which nobody knows of j
+    lapses: Array  # [M] s after which j does not start; FAR where it does not lapse
+    free: Array  # [N] s at which each agent can first set out
+    effort: Array  # [N] what a second of travel costs each agent
+    limit: Array  # [] s in which everything must be done
+    agent_mask: Array  # [N] bool
+    target_mask: Array  # [M] bool
+    unit: Array  # [] s by which times are divided where numbers of order one are wanted
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MacroState:
+    """A moment at which somebody has to decide, or the end.
+
+    An agent is free (`goal` is M), or bound to a target: on its way, waiting there, or serving.
+    """
+
+    problem: MacroProblem
+    now: Array  # [] s
+    node: Array  # [N] int32, the target where it is or will be when next free; M: its start
+    goal: Array  # [N] int32, the target it is bound to; M: none
+    busy: Array  # [N] s until it arrives at its goal, its service ends, or it can first set out
+    serving: Array  # [M] bool
+    solved: Array  # [M] bool; padded targets count as solved
+    since: Array  # [N] s, when it last became free
+    travelled: Array  # [N] s
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MacroResult:
+    """What one joint choice brings about."""
+
+    state: MacroState
+    seconds: Array  # [] s that passed; at the end, until everybody with a home is there too
+    effort: Array  # [] weighted s of travel set out on, at the end with the ways home
+    terminated: Array  # [] bool, every target is solved
+    truncated: Array  # [] bool, the limit was passed, or nothing can happen any more

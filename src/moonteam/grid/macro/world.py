@@ -1,0 +1,244 @@
+"""The rules of the macro world, as pure functions of one episode (vmap them over many).
+
+A decision is a target. An agent that is free chooses one, or to wait; it sets out at once and is
+bound until the target is solved. A service starts when the agents waiting at the target are the
+coalition that it needs, the targets before it have ended and it has appeared; it ends `service`
+seconds later, and its agents are free again. Between events nothing is decided; at every event
+that leaves an agent free, all free agents choose, one after the other.
+
+Choices that lead nowhere are not allowed (see `allowed`), so that no two agents wait for each
+other for ever, whatever a policy says. Legend as in `types`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from moonteam.grid.macro.types import FAR, MacroProblem, MacroResult, MacroState
+
+SOON = 5e-4
+"""s below which two events are one; tables are in whole milliseconds."""
+
+
+def reset(problem: MacroProblem) -> MacroState:
+    """The first moment at which somebody can decide."""
+    agents, targets = problem.start.shape
+    none = jnp.full(agents, targets, jnp.int32)
+    start = MacroState(
+        problem, jnp.zeros(()), none, none, problem.free, jnp.zeros(targets, bool),
+        ~problem.target_mask, problem.free, jnp.zeros(agents))
+    return _run(start, jnp.any(free(start)))[0]
+
+
+def legs(problem: MacroProblem, node: Array) -> Array:
+    """[N, M] s from where each agent is (`node` [N], M: its start) to each target."""
+    targets = problem.start.shape[1]
+    at = jnp.take_along_axis(problem.between, jnp.minimum(node, targets - 1)[:, None, None],
+                             axis=1)[:, 0]
+    return jnp.where((node == targets)[:, None], problem.start, at)
+
+
+def free(state: MacroState) -> Array:
+    """[N] bool, agents that choose now."""
+    problem = state.problem
+    return problem.agent_mask & (state.goal == problem.start.shape[1]) & (state.busy <= 0)
+
+
+def missing(problem: MacroProblem, goal: Array) -> Array:
+    """[M, S] agents of each skill that a target lacks, counting those bound to it by `goal` [N].
+
+    Of an OR target with anybody bound to it: none; before, one of each skill that will do.
+    """
+    bound = jax.nn.one_hot(goal, problem.start.shape[1], dtype=jnp.int32)  # [N, M]
+    there = bound.T @ problem.has.astype(jnp.int32)  # [M, S]
+    met = problem.either & jnp.any((there > 0) & (problem.need > 0), axis=1)
+    return jnp.where(met[:, None], 0, jnp.maximum(problem.need - there, 0))
+
+
+def open_targets(state: MacroState) -> Array:
+    """[M] bool: known, neither solved nor being served."""
+    return ~state.solved & ~state.serving & (state.now >= state.problem.shown - SOON)
+
+
+def allowed(state: MacroState, goal: Array) -> Array:
+    """[N, M] bool: what each agent may choose, given everybody's `goal` [N] so far.
+
+    An agent may go where it brings a skill that is missing there, if those still missing after
+    it can come from agents that do not themselves wait for others; and if all targets that must
+    come before are sure to be served. So the coalition begun last can always be completed, then
+    the one before it, and so on.
+    """
+    problem = state.problem
+    targets = problem.start.shape[1]
+    lacking = missing(problem, goal)  # [M, S]
+    complete = jnp.all(lacking == 0, axis=1)
+    here = jnp.minimum(goal, targets - 1)
+    stuck = (goal < targets) & ~complete[here]
+    loose = problem.agent_mask & ~stuck  # [N]
+    has = problem.has.astype(jnp.int32)
+    able = (problem.start < FAR).astype(jnp.int32)  # [N, M]
+    helps = jnp.any((lacking[None] > 0) & problem.has[:, None], axis=2)  # [N, M]
+    left = jnp.maximum(lacking[None] - has[:, None], 0)  # [N, M, S]
+    left = jnp.where(problem.either[None, :, None], 0, left)
+    can = (able * loose[:, None]).T @ has  # [M, S] loose agents with the skill
+    others = can[None] - (able * loose[:, None])[:, :, None] * has[:, None]
+    whole = jnp.all(others >= left, axis=2)
+    sure = state.solved | state.serving | (complete & problem.target_mask)
+    before = jnp.all(~problem.after | sure[None], axis=1)  # [M]
+    arrives = state.now + legs(problem, state.node)
+    in_time = arrives <= jnp.minimum(problem.lapses, FAR / 2) + SOON
+    return (open_targets(state) & before)[None] & helps & whole & in_time & free(state)[:, None]
+
+
+def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array]:
+    """The free agents' choices, one after the other, the surest first.
+
+    Args:
+      state: the moment.
+      logits: [N, M + 1], each target, then waiting.
+      noise: [N, M + 1] added where the likeliest is taken: zeros for argmax, Gumbel's to sample.
+
+    Returns:
+      Choices [N] int32, M for waiting and of agents that are not free; and what each could
+      choose from when its turn came, [N, M + 1] bool (waiting alone of those not free).
+    """
+    agents, targets = state.problem.start.shape
+    everyone = jnp.arange(agents)
+
+    def turn(carry: tuple, _: None) -> tuple[tuple, None]:
+        goal, choice, mask, todo, coming = carry
+        may = allowed(state, goal) & todo[:, None]  # [N, M]
+        some = jnp.any(may, axis=1)
+        # Somebody must go if nobody is on the way: the last who can.
+        wait = coming | (jnp.sum(some) > 1) | ~some
+        options = jnp.concatenate([may, wait[:, None]], axis=1)
+        held = jnp.where(options, logits, -FAR)
+        sure = jnp.max(jax.nn.log_softmax(held, axis=1), axis=1)
+        # Who has no choice comes last, not to count as the surest.
+        first = jnp.argmax(jnp.where(todo, jnp.where(some, sure, -2 * FAR), -3 * FAR))
+        pick = jnp.argmax(jnp.where(options[first], logits[first] + noise[first], -FAR))
+        pick = pick.astype(jnp.int32)
+        own = (everyone == first) & todo
+        choice = jnp.where(own, pick, choice)
+        mask = jnp.where(own[:, None], options, mask)
+        goal = jnp.where(own, pick, goal)
+        return (goal, choice, mask, todo & ~own, coming | (jnp.any(own) & (pick < targets))), None
+
+    alone = jnp.zeros((agents, targets + 1), bool).at[:, targets].set(True)
+    coming = jnp.any(state.busy > 0)
+    none = jnp.full(agents, targets, jnp.int32)
+    start = (state.goal, none, alone, free(state), coming)
+    (_, choice, mask, _, _), _ = jax.lax.scan(turn, start, None, agents)
+    return choice, mask
+
+
+def step(state: MacroState, choice: Array) -> MacroResult:
+    """Everybody free sets out for its `choice` [N] (M: waits); then to the next decision.
+
+    Choices of agents that are not free are not looked at.
+    """
+    problem = state.problem
+    targets = problem.start.shape[1]
+    going = free(state) & (choice < targets)
+    index = jnp.minimum(choice, targets - 1)
+    leg = jnp.take_along_axis(legs(problem, state.node), index[:, None], axis=1)[:, 0]
+    leg = jnp.where(going, leg, 0.0)
+    out = replace(
+        state, goal=jnp.where(going, choice, state.goal), node=jnp.where(going, choice, state.node),
+        busy=jnp.where(going, leg, state.busy), travelled=state.travelled + leg)
+    after, dead = _run(out, jnp.array(False))
+    done = jnp.all(after.solved)
+    # Who served nothing more was on the way home since it was last free.
+    way = jnp.where(problem.agent_mask, _way_home(after), 0.0)
+    end = jnp.maximum(jnp.max(jnp.where(problem.agent_mask, after.since + way, 0.0)), after.now)
+    end = jnp.where(done, end, after.now)
+    effort = jnp.sum(problem.effort * (leg + jnp.where(done, way, 0.0)))
+    return MacroResult(after, end - state.now, effort, done,
+                       ~done & (dead | (after.now >= problem.limit - SOON)))
+
+
+def _way_home(state: MacroState) -> Array:
+    """[N] s home from where each agent is."""
+    problem = state.problem
+    targets = problem.start.shape[1]
+    at = jnp.take_along_axis(problem.home, jnp.minimum(state.node, targets - 1)[:, None],
+                             axis=1)[:, 0]
+    return jnp.where(state.node == targets, problem.home_now, at)
+
+
+def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
+    """To the next moment at which somebody is free, or the end; and whether it can only fail.
+
+    Event by event: services that can start do; then time goes on to the next arrival, end of a
+    service or appearance. `moved` [] bool: the present moment is such a one.
+    """
+    def waits(carry: tuple) -> Array:
+        state, dead, moved = carry
+        over = jnp.all(state.solved) | (state.now >= state.problem.limit - SOON)
+        decide = moved & jnp.any(free(state)) & jnp.any(open_targets(state))
+        return ~(over | dead | decide)
+
+    def event(carry: tuple) -> tuple:
+        state, _, _ = carry
+        started = _start(state)
+        instant = jnp.any(started.solved & ~state.solved)
+        later, dead = _advance(started)
+        # A service without length sets its agents free at once: no time passes.
+        after = jax.tree.map(lambda a, b: jnp.where(instant, a, b), started, later)
+        return after, dead & ~instant, jnp.array(True)
+
+    state, dead, _ = jax.lax.while_loop(waits, event, (state, jnp.array(False), moved))
+    return state, dead
+
+
+def _start(state: MacroState) -> MacroState:
+    """Starts every service whose coalition waits."""
+    problem = state.problem
+    targets = problem.start.shape[1]
+    waiting = (state.goal < targets) & (state.busy <= 0)
+    there = jnp.where(waiting, state.goal, targets)
+    met = jnp.all(missing(problem, there) == 0, axis=1)
+    before = jnp.all(~problem.after | state.solved[None], axis=1)
+    window = (state.now >= problem.appears - SOON) & (state.now <= problem.lapses + SOON)
+    starts = open_targets(state) & met & before & window
+    at_once = starts & (problem.service <= 0)
+    here = jnp.minimum(state.goal, targets - 1)
+    serves = waiting & starts[here]
+    ends = serves & at_once[here]
+    return replace(
+        state, serving=state.serving | (starts & ~at_once), solved=state.solved | at_once,
+        busy=jnp.where(serves, problem.service[here], state.busy),
+        goal=jnp.where(ends, targets, state.goal), since=jnp.where(ends, state.now, state.since))
+
+
+def _advance(state: MacroState) -> tuple[MacroState, Array]:
+    """To the next event; and whether there is none."""
+    problem = state.problem
+    targets = problem.start.shape[1]
+    arrivals = jnp.where((state.busy > 0) & problem.agent_mask, state.busy, FAR)
+    here = jnp.minimum(state.goal, targets - 1)
+    waiting = (state.goal < targets) & (state.busy <= 0)
+    opens = problem.appears[here] - state.now
+    opens = jnp.where(waiting & (opens > 0), opens, FAR)
+    news = problem.shown - state.now
+    news = jnp.where((news > SOON) & ~state.solved, news, FAR)
+    wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)), jnp.min(news))
+    late = ~state.solved & ~state.serving & (state.now > problem.lapses + SOON)
+    dead = (wait >= FAR / 2) | jnp.any(late)
+    wait = jnp.where(dead, 0.0, jnp.minimum(wait, jnp.maximum(problem.limit - state.now, 0.0)))
+    busy = state.busy - wait
+    busy = jnp.where(busy <= SOON, 0.0, busy)
+    now = state.now + wait
+    bound = state.goal < targets
+    finished = bound & state.serving[here] & (busy <= 0)
+    ended = jnp.any(jax.nn.one_hot(jnp.where(finished, state.goal, targets), targets,
+                                   dtype=bool), axis=0)
+    released = (state.busy > 0) & (busy <= 0) & ~bound  # of those that could not yet set out
+    return replace(
+        state, now=now, busy=busy, serving=state.serving & ~ended, solved=state.solved | ended,
+        goal=jnp.where(finished, targets, state.goal),
+        since=jnp.where(finished | released, now, state.since)), dead

@@ -1,0 +1,280 @@
+"""One network for every team by the clock: who is free points at its next target.
+
+Every agent and every target is a token; masked self-attention mixes them, its logits biased by
+what each pair is to each other. What it sees are times and relations, never places, names of
+skills or units: it is the same for a map turned or mirrored, for skills renamed, for seconds or
+steps. So the same weights serve the grid (a cell a step), the ground (seconds of each kind over
+slopes) and the instances of others.
+
+Decentralised reading: all that goes in is known to all robots (positions, goals, targets); each
+free robot computes the pass and takes its own row. The value, from the same tokens, is used in
+training alone.
+
+Legend: B batch, N agents, M targets, E = N + M tokens, S skills, D width, K heads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jax import Array
+
+from moonteam.errors import InputError
+from moonteam.grid.macro import world
+from moonteam.grid.macro.types import FAR, MacroState
+from moonteam.policies.entity import Block, EntitySpec
+
+LONG = 16.0
+"""Units of time above which it makes no difference how long."""
+
+
+@dataclass(frozen=True)
+class PointerSpec:
+    """Size of the network; teams and targets of any number fit all of them."""
+
+    width: int = 64
+    """D, features of a token."""
+    heads: int = 4
+    """K, attention heads; divides the width."""
+    layers: int = 3
+    """Attention blocks."""
+    pairs: int = 32
+    """Features of a pair of tokens."""
+
+    def check(self, source: object) -> None:
+        """Raises InputError if the numbers make no network."""
+        if min(self.width, self.heads, self.layers, self.pairs) < 1 or self.width % self.heads:
+            raise InputError(source, f"heads ({self.heads}) must divide width ({self.width})")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Outlook:
+    """What the network sees of one moment; any leading batch axes, here written [B].
+
+    Times are in units of the moment: about 1 for a usual way.
+    """
+
+    agents: Array  # [B, N] bool, in the team
+    targets: Array  # [B, M] bool, known and lacking somebody
+    free: Array  # [B, N] bool, chooses now
+    spare: Array  # [B, N] time until it is free, if it is bound
+    slow: Array  # [B, N] log of its time between targets over the quickest's
+    travel: Array  # [B, N, M] time until it could be at the target; LONG: never
+    between: Array  # [B, M, M] time between targets, by the quickest
+    goal: Array  # [B, N, M] bool, bound to the target
+    has: Array  # [B, N, S] bool
+    lacks: Array  # [B, M, S] agents missing of each skill
+    either: Array  # [B, M] bool, any of them will do
+    service: Array  # [B, M] time
+    ready: Array  # [B, M] time before which it cannot start
+    left: Array  # [B, M] time until it lapses; LONG: never
+    after: Array  # [B, M, M] bool, after[j, k]: j waits for k
+    home: Array  # [B, N, M] time from the target home
+    preference: Array  # [B] 0 time .. 1 effort
+
+
+def look(state: MacroState, preference: Array) -> Outlook:
+    """One moment of the macro world as the network sees it (vmap it over episodes)."""
+    p = state.problem
+    targets = p.start.shape[1]
+    lacks = world.missing(p, state.goal)
+    incomplete = jnp.any(lacks > 0, axis=1)
+    shown = state.now >= p.shown - world.SOON
+    open_ = world.open_targets(state) & incomplete
+    bound = state.goal < targets
+    here = jnp.minimum(state.goal, targets - 1)
+    legs = world.legs(p, state.node)
+    goal = jax.nn.one_hot(state.goal, targets, dtype=bool)
+    ready = jnp.maximum(p.appears - state.now, 0.0)
+    # A coalition meets when its last is there; of those still missing, at the soonest of the rest.
+    arrive = jnp.max(jnp.where(goal, state.busy[:, None], 0.0), axis=0)  # [M]
+    loose = p.agent_mask & ~(bound & incomplete[here])
+    come = jnp.where(loose[:, None], state.busy[:, None] + legs, FAR)  # [N, M]
+    soonest = jnp.min(jnp.where(p.has[:, None] & (lacks[None] > 0), come[:, :, None], FAR), axis=0)
+    soonest = jnp.where(lacks > 0, soonest, 0.0)  # [M, S]
+    soonest = jnp.where(p.either, jnp.min(jnp.where(lacks > 0, soonest, FAR), axis=1),
+                        jnp.max(soonest, axis=1))
+    soonest = jnp.where(incomplete, jnp.where(soonest < FAR, soonest, 0.0), 0.0)
+    meet = jnp.maximum(jnp.maximum(arrive, soonest), ready)
+    ends = jnp.where(state.serving, 0.0, meet + p.service)
+    spare = jnp.where(bound, jnp.where(state.serving[here], state.busy, ends[here]), state.busy)
+    travel = jnp.where(goal & ~state.serving[None], state.busy[:, None], spare[:, None] + legs)
+    best = jnp.min(jnp.where(p.agent_mask[:, None, None], p.between, FAR), axis=0)
+    known = open_[:, None] & open_[None] & (best > 0) & (best < FAR)
+    ways = jnp.where(known[None] & (p.between < FAR), p.between, 0.0)
+    ratio = jnp.sum(ways, axis=(1, 2)) / jnp.maximum(jnp.sum(jnp.where(ways > 0, best, 0.0),
+                                                             axis=(1, 2)), 1e-6)
+    first = jnp.where(open_ & (p.start < FAR), p.start, FAR)
+    plain = jnp.min(first, axis=0)
+    alone = jnp.sum(jnp.where(first < FAR, p.start, 0.0), 1) / jnp.maximum(
+        jnp.sum(jnp.where(first < FAR, plain, 0.0), 1), 1e-6)
+    slow = jnp.log(jnp.clip(jnp.where(ratio > 0, ratio, alone), 0.05, 20.0))
+    waits = p.after & ~state.solved[None]
+    busy = state.serving | (shown & ~incomplete)  # under way
+    under = jnp.max(jnp.where(state.serving[None] & goal, state.busy[:, None], 0.0), axis=0)
+    under = jnp.where(state.serving, under, ends)
+    ready = jnp.maximum(ready, jnp.max(jnp.where(waits & busy[None], under[None], 0.0), axis=1))
+
+    def norm(times: Array) -> Array:
+        return jnp.minimum(times / p.unit, LONG)
+
+    return Outlook(
+        agents=p.agent_mask, targets=open_, free=world.free(state), spare=norm(spare), slow=slow,
+        travel=norm(travel), between=norm(best), goal=goal, has=p.has, lacks=lacks,
+        either=p.either, service=norm(p.service), ready=norm(ready),
+        left=norm(jnp.maximum(p.lapses - state.now, 0.0)), after=waits, home=norm(p.home),
+        preference=preference)
+
+
+def _token_features(view: Outlook) -> tuple[Array, Array]:
+    """[B, N, .] and [B, M, .] features of each entity by itself."""
+    has = (view.has & view.agents[..., None]).astype(jnp.float32)
+    asks = view.lacks * view.targets[..., None]
+    supply = jnp.sum(has, axis=-2)  # [B, S]
+    demand = jnp.sum(asks, axis=-2).astype(jnp.float32)
+    scarce = demand / jnp.maximum(supply, 1.0)
+    brings = jnp.any((view.lacks[..., None, :, :] > 0) & view.has[..., :, None, :], axis=-1)
+    can = brings & view.targets[..., None, :] & view.agents[..., :, None] & (view.travel < LONG)
+    reach = jnp.where(can, view.travel, LONG)
+    near = jnp.min(reach, axis=-2)  # [B, M]
+    second = jnp.min(jnp.where(reach > near[..., None, :], reach, LONG), axis=-2)
+    each = jnp.min(jnp.where((view.has[..., :, None, :] & (view.travel < LONG)[..., None])
+                             & view.agents[..., :, None, None], view.travel[..., None], LONG),
+                   axis=-3)  # [B, M, S]
+    meet = jnp.max(jnp.where(view.lacks > 0, each, 0.0), axis=-1)
+    meet = jnp.where(view.either, near, meet) * view.targets
+    moment = jnp.stack([
+        jnp.log1p(jnp.sum(view.agents, -1)), jnp.log1p(jnp.sum(view.targets, -1)),
+        jnp.log1p(jnp.sum(can, axis=(-1, -2))), view.preference,
+        jnp.max(meet, axis=-1), jnp.sum(meet, axis=-1) / 8.0,
+        jnp.max(jnp.where(view.agents, view.spare, 0.0), axis=-1)], axis=-1)
+
+    def with_moment(*parts: Array) -> Array:
+        spread = (*moment.shape[:-1], parts[0].shape[-1], moment.shape[-1])
+        shared = jnp.broadcast_to(moment[..., None, :], spread)
+        return jnp.concatenate([jnp.stack(parts, axis=-1), shared], axis=-1)
+
+    agents = with_moment(
+        view.slow, view.spare, view.free.astype(jnp.float32),
+        jnp.any(view.goal, -1).astype(jnp.float32), jnp.min(reach, axis=-1),
+        jnp.log1p(jnp.sum(can, axis=-1)), jnp.sum(has, -1) / 2.0,
+        jnp.log1p(jnp.sum(has * scarce[..., None, :], -1)),
+        jnp.max(has * scarce[..., None, :], -1))
+    wanted = view.lacks.astype(jnp.float32)
+    started = jnp.any(view.goal & view.agents[..., None], axis=-2)
+    targets = with_moment(
+        jnp.sum(wanted, -1) / 2.0, jnp.sum(wanted > 0, -1) / 2.0, view.either.astype(jnp.float32),
+        near, second, meet, jnp.log1p(jnp.sum(can, axis=-2)), view.service, view.ready,
+        started.astype(jnp.float32), jnp.exp(-view.left), jnp.exp(-view.left / 4.0),
+        jnp.log1p(jnp.sum(view.after & view.targets[..., None, :], -1)),
+        jnp.log1p(jnp.sum(view.after & view.targets[..., :, None], -2)),
+        jnp.sum(jnp.where(wanted > 0, scarce[..., None, :], 0.0), -1))
+    return agents, targets
+
+
+def _pair_features(view: Outlook) -> Array:
+    """[B, E, E, F] what token j is to token i."""
+    has = view.has.astype(jnp.float32)
+    asks = (view.lacks > 0).astype(jnp.float32)
+    aa = has @ jnp.swapaxes(has, -1, -2)
+    am = has @ jnp.swapaxes(asks, -1, -2)  # [B, N, M]
+    mm = asks @ jnp.swapaxes(asks, -1, -2)
+    size = jnp.sum(asks, -1)
+    left = jnp.where(view.either[..., None, :], 0.0, size[..., None, :] - am)
+    covers = ((am > 0) & (left <= 0)).astype(jnp.float32)
+    none = jnp.zeros_like(aa)
+
+    def whole(a: Array, b: Array, c: Array, d: Array) -> Array:
+        return jnp.concatenate([jnp.concatenate([a, b], -1), jnp.concatenate([c, d], -1)], -2)
+
+    def swap(x: Array) -> Array:
+        return jnp.swapaxes(x, -1, -2)
+
+    travel = whole(none, view.travel, swap(view.travel), view.between)
+    goal, after = view.goal.astype(jnp.float32), view.after.astype(jnp.float32)
+    same = (jnp.sum(goal[..., :, None, :] * goal[..., None, :, :], -1))
+    return jnp.stack([
+        travel, jnp.log1p(4.0 * travel), jnp.exp(-2.0 * travel), jnp.exp(-8.0 * travel),
+        whole(aa, am, swap(am), mm), whole(none, covers, swap(covers), jnp.zeros_like(mm)),
+        whole(same, goal, swap(goal), after), whole(none, view.home, swap(view.home), swap(after)),
+    ], axis=-1)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pointed:
+    """What the network says of one moment."""
+
+    logits: Array  # [B, N, M + 1] each target, then waiting
+    value: Array  # [B] expected return of the team, in units of the moment
+
+
+class Pointer(nn.Module):
+    """Outlook -> each agent's logits over the targets, and the team's value."""
+
+    spec: PointerSpec = PointerSpec()
+
+    @nn.compact
+    def __call__(self, view: Outlook) -> Pointed:
+        """Any number of agents and targets, any leading batch axes."""
+        spec = self.spec
+        agents, targets = _token_features(view)
+        n = agents.shape[-2]
+        x = jnp.concatenate([nn.Dense(spec.width, name="agent")(agents),
+                             nn.Dense(spec.width, name="target")(targets)], axis=-2)
+        mask = jnp.concatenate([view.agents, view.targets], axis=-1)
+        pairs = nn.gelu(nn.Dense(spec.pairs, name="pairs")(_pair_features(view)))
+        # One bias for each ordered pair of roles: agents and targets read a pair differently.
+        biases = self._by_role(pairs, n, spec.layers * spec.heads)
+        sizes = EntitySpec(spec.width, spec.heads, spec.layers)
+        for layer in range(spec.layers):
+            part = biases[..., layer * spec.heads : (layer + 1) * spec.heads]
+            x = Block(sizes, name=f"block{layer}")(x, part, mask)
+        x = nn.LayerNorm(name="last")(x)
+        return Pointed(self._point(x, pairs, n), self._value(x, mask))
+
+    def _by_role(self, pairs: Array, n: int, outputs: int) -> Array:
+        rows = []
+        for i, own in ((slice(0, n), "agent"), (slice(n, None), "target")):
+            parts = [nn.Dense(outputs, name=f"bias_{own}_{other}")(pairs[..., i, j, :])
+                     for j, other in ((slice(0, n), "agent"), (slice(n, None), "target"))]
+            rows.append(jnp.concatenate(parts, axis=-2))
+        return jnp.concatenate(rows, axis=-3)
+
+    def _point(self, x: Array, pairs: Array, n: int) -> Array:
+        width = self.spec.width
+        query = nn.Dense(width, name="query")(x[..., :n, :])
+        key = nn.Dense(width, name="key")(x[..., n:, :])
+        bias = nn.Dense(1, name="point_bias")(pairs[..., :n, n:, :])[..., 0]
+        logits = jnp.einsum("...nd,...md->...nm", query, key) * width**-0.5 + bias
+        stay = nn.Dense(1, name="stay")(x[..., :n, :])
+        return jnp.concatenate([logits, stay], axis=-1)
+
+    def _value(self, x: Array, mask: Array) -> Array:
+        real = mask[..., None]
+        mean = jnp.sum(jnp.where(real, x, 0.0), axis=-2) / jnp.maximum(jnp.sum(real, -2), 1)
+        most = jnp.max(jnp.where(real, x, -FAR), axis=-2)
+        most = jnp.where(jnp.any(real, -2), most, 0.0)
+        pooled = nn.gelu(nn.Dense(self.spec.width, name="pool")(jnp.concatenate([mean, most], -1)))
+        return nn.Dense(1, name="value")(pooled)[..., 0]
+
+
+def point(params: Any, spec: PointerSpec, view: Outlook) -> Pointed:
+    """The network's word on a batch of moments; `params` as from `init`."""
+    return cast(Pointed, Pointer(spec).apply({"params": params}, view))
+
+
+def init(spec: PointerSpec, key: Array) -> Any:
+    """Fresh parameters; their shapes hold for teams of any size."""
+    flag, number = jnp.zeros(2, bool), jnp.zeros(2)
+    square = jnp.zeros((2, 2))
+    view = Outlook(
+        agents=~flag, targets=~flag, free=~flag, spare=number, slow=number, travel=square,
+        between=square, goal=square > 0, has=square > 0, lacks=square, either=flag, service=number,
+        ready=number, left=number, after=square > 0, home=square, preference=jnp.zeros(()))
+    return Pointer(spec).init(key, view)["params"]

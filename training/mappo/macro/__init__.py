@@ -1,0 +1,1 @@
+"""MAPPO whose decisions are targets, held until something happens; no teacher."""

@@ -1,0 +1,233 @@
+"""One PPO update on macro-decisions: collect, judge, improve.
+
+Semi-Markov: a decision lasts until the next one, and its reward is minus the time that passed and
+a little of the way that was set out on; with no discount, a return is minus what an episode still
+costs. Advantages are the team's; each agent that chose is moved by it.
+
+Legend: T decisions, E environments, B moments of a minibatch, N agents, M targets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from moonteam import trees
+from moonteam.grid.macro import world
+from moonteam.grid.macro.draw import Draw, draw
+from moonteam.grid.macro.types import FAR, MacroState
+from moonteam.policies.pointer import Outlook, PointerSpec, look, point
+from training.mappo.gae import advantages
+
+
+@dataclass(frozen=True)
+class Hyper:
+    """What an update needs to know; static under jit."""
+
+    num_envs: int = 512
+    """E, environments side by side."""
+    num_steps: int = 16
+    """T, decisions of each between updates."""
+    epochs: int = 2
+    """Passes over what was collected."""
+    minibatches: int = 8
+    """Parts of a pass."""
+    gae_lambda: float = 0.95
+    """Of generalised advantage estimation; the discount is 1."""
+    clip_eps: float = 0.2
+    """Of the probability ratio."""
+    vf_coef: float = 0.5
+    """Weight of the critic's squared error."""
+    max_grad_norm: float = 0.5
+    """Gradient norm above which gradients are scaled down."""
+    failure: float = 1.0
+    """What each target left costs when an episode is cut off, in units of time."""
+    tie: float = 0.02
+    """Weight that time and way both keep at either end of the preference."""
+    spread: bool = False
+    """Preferences drawn from time to effort; else always time."""
+    ema: float = 0.998
+    """Decay of the running mean of the weights, which is what is kept."""
+
+
+class Walk(NamedTuple):
+    """Environments between two updates."""
+
+    states: MacroState  # [E]
+    preference: Array  # [E]
+
+
+class Rows(NamedTuple):
+    """What was decided; [T, E, ...]."""
+
+    view: Outlook
+    choice: Array  # [.., N]
+    options: Array  # [.., N, M + 1] bool, at the agent's turn
+    log_prob: Array  # [.., N]
+    value: Array
+    reward: Array
+    ended: Array
+    truncated: Array
+
+
+class Learner(NamedTuple):
+    """What learning changes."""
+
+    params: Any
+    mean: Any  # running mean of the parameters
+    optimiser: optax.OptState
+
+
+class Report(NamedTuple):
+    """Of one update."""
+
+    success: Array
+    seconds: Array  # mean length of the episodes that ended
+    entropy: Array
+    value_loss: Array
+    clipped: Array
+    episodes: Array
+
+
+def fresh(family: Draw, hyper: Hyper, key: Array, count: int) -> Walk:
+    """New episodes at their start."""
+    key, wish = jax.random.split(key)
+    states = jax.vmap(lambda k: world.reset(draw(family, k)))(jax.random.split(key, count))
+    prefer = jnp.zeros(count)
+    if hyper.spread:  # a quarter each at the two ends of the preference, the rest in between
+        prefer = jnp.clip(jax.random.uniform(wish, (count,), minval=-0.5, maxval=1.5), 0.0, 1.0)
+    return Walk(states, prefer)
+
+
+def optimiser(hyper: Hyper) -> optax.GradientTransformation:
+    """Adam behind a gradient-norm clip; the rate is given with each update."""
+    return optax.chain(optax.clip_by_global_norm(hyper.max_grad_norm),
+                       optax.scale_by_adam(eps=1e-5))
+
+
+def chosen(logits: Array, options: Array, choice: Array) -> tuple[Array, Array]:
+    """Log-probability [..., N] of the choices among the options, and entropy [..., N]."""
+    log_probs = jax.nn.log_softmax(jnp.where(options, logits, -FAR), axis=-1)
+    taken = jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0]
+    entropy = -jnp.sum(jnp.where(options, jnp.exp(log_probs) * log_probs, 0.0), axis=-1)
+    return taken, entropy
+
+
+def collect(spec: PointerSpec, family: Draw, hyper: Hyper, params: Any, walk: Walk,
+            key: Array) -> tuple[Walk, Rows, Array, Array]:
+    """T decisions of every environment; the value after them; lengths of ended episodes."""
+    pool_key, key = jax.random.split(key)
+    count = hyper.num_envs
+    pool = fresh(family, hyper, pool_key, count)
+
+    def see(walk: Walk) -> Outlook:
+        return jax.vmap(look)(walk.states, walk.preference)
+
+    def decide(walk: Walk, at: tuple[Array, Array]) -> tuple[Walk, tuple]:
+        t, key = at
+        view = see(walk)
+        said = point(params, spec, view)
+        noise = jax.random.gumbel(key, said.logits.shape)
+        choice, options = jax.vmap(world.choose)(walk.states, said.logits, noise)
+        log_prob, _ = chosen(said.logits, options, choice)
+        result = jax.vmap(world.step)(walk.states, choice)
+        by_time = 1.0 - walk.preference + hyper.tie
+        by_way = walk.preference + hyper.tie
+        unit = walk.states.problem.unit
+        open_ = jnp.sum(~result.state.solved, axis=-1)
+        reward = -(by_time * result.seconds + by_way * result.effort) / unit
+        reward = reward - hyper.failure * jnp.where(result.truncated, open_, 0)
+        ended = result.terminated | result.truncated
+        # Fresh episodes come from a pool, each environment's from another place at each step.
+        new = jax.tree.map(lambda x: jnp.roll(x, t, axis=0), pool)
+        after = trees.where(ended, new, Walk(result.state, walk.preference))
+        row = Rows(view, choice, options, log_prob, said.value, reward, ended, result.truncated)
+        return after, (row, jnp.where(ended, walk.states.now + result.seconds, 0.0))
+
+    keys = jax.random.split(key, hyper.num_steps)
+    walk, (rows, lengths) = jax.lax.scan(decide, walk, (jnp.arange(hyper.num_steps), keys))
+    return walk, rows, point(params, spec, see(walk)).value, lengths
+
+
+class Batch(NamedTuple):
+    """Moments to learn from; [B, ...]."""
+
+    view: Outlook
+    choice: Array
+    options: Array
+    log_prob: Array
+    advantage: Array
+    target: Array
+
+
+def loss(params: Any, spec: PointerSpec, hyper: Hyper, batch: Batch,
+         entropy_weight: Array) -> tuple[Array, Array]:
+    """Clipped PPO of every agent that had a choice, critic, entropy."""
+    said = point(params, spec, batch.view)
+    log_prob, entropy = chosen(said.logits, batch.options, batch.choice)
+    real = jnp.sum(batch.options, axis=-1) > 1
+    count = jnp.maximum(jnp.sum(real), 1)
+    ratio = jnp.exp(log_prob - batch.log_prob)
+    gain = batch.advantage[:, None]
+    limited = jnp.clip(ratio, 1.0 - hyper.clip_eps, 1.0 + hyper.clip_eps)
+    policy = -jnp.sum(jnp.where(real, jnp.minimum(ratio * gain, limited * gain), 0.0)) / count
+    spread = jnp.sum(jnp.where(real, entropy, 0.0)) / count
+    critic = 0.5 * jnp.mean((said.value - batch.target) ** 2)
+    clipped = jnp.sum(real & (jnp.abs(ratio - 1.0) > hyper.clip_eps)) / count
+    return policy + hyper.vf_coef * critic - entropy_weight * spread, jnp.stack(
+        [spread, critic, clipped])
+
+
+def update(spec: PointerSpec, family: Draw, hyper: Hyper, learner: Learner, walk: Walk, key: Array,
+           lr: Array, entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+    """Collect, then improve."""
+    collect_key, order_key = jax.random.split(key)
+    walk, rows, last, lengths = collect(spec, family, hyper, learner.params, walk, collect_key)
+    following = jnp.concatenate([rows.value[1:], last[None]])
+    # A cut-off episode has paid for what it left: an end like any other.
+    gain = advantages(rows.reward, rows.value, following, rows.ended, jnp.zeros_like(rows.ended),
+                      1.0, hyper.gae_lambda)
+    target = gain + rows.value
+    gain = (gain - gain.mean()) / (gain.std() + 1e-6)
+    batch = Batch(rows.view, rows.choice, rows.options, rows.log_prob, gain, target)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    total = hyper.num_envs * hyper.num_steps
+    rule = optimiser(hyper)
+
+    def improve(learner: Learner, index: Array) -> tuple[Learner, Array]:
+        part = jax.tree.map(lambda x: x[index], flat)
+        (_, said), slope = jax.value_and_grad(loss, has_aux=True)(
+            learner.params, spec, hyper, part, entropy_weight)
+        way, state = rule.update(slope, learner.optimiser)
+        params = jax.tree.map(lambda p, w: p - lr * w, learner.params, way)
+        mean = jax.tree.map(lambda m, p: hyper.ema * m + (1 - hyper.ema) * p, learner.mean, params)
+        return Learner(params, mean, state), said
+
+    order = jax.vmap(lambda k: jax.random.permutation(k, total))(
+        jax.random.split(order_key, hyper.epochs))
+    learner, said = jax.lax.scan(improve, learner,
+                                 order.reshape(hyper.epochs * hyper.minibatches, -1))
+    episodes = jnp.sum(rows.ended)
+    count = jnp.maximum(episodes, 1)
+    spread, critic, clipped = said.mean(axis=0)
+    return learner, walk, Report(
+        jnp.sum(rows.ended & ~rows.truncated) / count, jnp.sum(lengths) / count, spread, critic,
+        clipped, episodes)
+
+
+@partial(jax.jit, static_argnames=("spec", "family", "hyper"), donate_argnames=("learner", "walk"))
+def several(spec: PointerSpec, family: Draw, hyper: Hyper, learner: Learner, walk: Walk,
+            keys: Array, lr: Array, entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+    """One update for each of `keys`, `lr` and `entropy_weight` [U]."""
+    def one(carry: tuple[Learner, Walk], at: tuple) -> tuple[tuple[Learner, Walk], Report]:
+        learner, walk, report = update(spec, family, hyper, *carry, *at)
+        return (learner, walk), report
+
+    (learner, walk), reports = jax.lax.scan(one, (learner, walk), (keys, lr, entropy_weight))
+    return learner, walk, reports
