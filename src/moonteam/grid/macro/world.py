@@ -3,8 +3,8 @@
 A decision is a target. An agent that is free chooses one, or to wait; it sets out at once and is
 bound until the target is solved. A service starts when all agents bound to the target wait there
 and are the coalition that it needs, the targets before it have ended and it has appeared; it ends
-`service` seconds later, and its agents are free again. Between events nothing is decided; at every event
-that leaves an agent free, all free agents choose, one after the other.
+`service` seconds later, and its agents are free again. Between events nothing is decided; at
+every event that leaves an agent free, all free agents choose, one after the other.
 
 Choices that lead nowhere are not allowed (see `allowed`), so that no two agents wait for each
 other for ever, whatever a policy says. Legend as in `types`.
