@@ -2,8 +2,8 @@
 
 A decision is a target. An agent that is free chooses one, or to wait; it sets out at once and is
 bound until the target is solved. A service starts when the agents waiting at the target are the
-coalition that it needs, the targets before it have ended and it has appeared; it ends `service`
-seconds later, and its agents are free again. Between events nothing is decided; at every event
+coalition that it needs, nobody bound to it is still on the way, the targets before it have ended
+and it has appeared; it ends `service` seconds later, and its agents are free again. Between events nothing is decided; at every event
 that leaves an agent free, all free agents choose, one after the other.
 
 Choices that lead nowhere are not allowed (see `allowed`), so that no two agents wait for each
@@ -157,8 +157,7 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     end = jnp.maximum(jnp.max(jnp.where(problem.agent_mask, after.since + way, 0.0)), after.now)
     end = jnp.where(done, end, after.now)
     effort = jnp.sum(problem.effort * (leg + jnp.where(done, way, 0.0)))
-    return MacroResult(after, end - state.now, effort, done,
-                       ~done & (dead | (after.now >= problem.limit - SOON)))
+    return MacroResult(after, end - state.now, effort, done, ~done & dead)
 
 
 def _way_home(state: MacroState) -> Array:
@@ -178,9 +177,8 @@ def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
     """
     def waits(carry: tuple) -> Array:
         state, dead, moved = carry
-        over = jnp.all(state.solved) | (state.now >= state.problem.limit - SOON)
         decide = moved & jnp.any(free(state)) & jnp.any(open_targets(state))
-        return ~(over | dead | decide)
+        return ~(jnp.all(state.solved) | dead | decide)
 
     def event(carry: tuple) -> tuple:
         state, _, _ = carry
@@ -201,7 +199,11 @@ def _start(state: MacroState) -> MacroState:
     targets = problem.start.shape[1]
     waiting = (state.goal < targets) & (state.busy <= 0)
     there = jnp.where(waiting, state.goal, targets)
-    met = jnp.all(missing(problem, there) == 0, axis=1)
+    # Who is bound and still on the way is waited for, even where those there would do.
+    coming = (state.goal < targets) & (state.busy > 0)
+    awaited = jnp.any(jax.nn.one_hot(jnp.where(coming, state.goal, targets), targets, dtype=bool),
+                      axis=0)
+    met = jnp.all(missing(problem, there) == 0, axis=1) & ~awaited
     before = jnp.all(~problem.after | state.solved[None], axis=1)
     window = (state.now >= problem.appears - SOON) & (state.now <= problem.lapses + SOON)
     starts = open_targets(state) & met & before & window
@@ -216,7 +218,7 @@ def _start(state: MacroState) -> MacroState:
 
 
 def _advance(state: MacroState) -> tuple[MacroState, Array]:
-    """To the next event; and whether there is none."""
+    """To the next event; and whether there is none, or none before the limit."""
     problem = state.problem
     targets = problem.start.shape[1]
     arrivals = jnp.where((state.busy > 0) & problem.agent_mask, state.busy, FAR)
@@ -229,7 +231,10 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)), jnp.min(news))
     late = ~state.solved & ~state.serving & (state.now > problem.lapses + SOON)
     dead = (wait >= FAR / 2) | jnp.any(late)
-    wait = jnp.where(dead, 0.0, jnp.minimum(wait, jnp.maximum(problem.limit - state.now, 0.0)))
+    left = jnp.maximum(problem.limit - state.now, 0.0)
+    over = wait > left + SOON
+    wait = jnp.where(dead, 0.0, jnp.where(over, left, wait))
+    dead = dead | over
     busy = state.busy - wait
     busy = jnp.where(busy <= SOON, 0.0, busy)
     now = state.now + wait
