@@ -90,7 +90,7 @@ def allowed(state: MacroState, goal: Array) -> Array:
     sure = state.solved | state.serving | (complete & problem.target_mask)
     before = jnp.all(~problem.after | sure[None], axis=1)  # [M]
     arrives = state.now + legs(problem, state.node)
-    in_time = arrives <= jnp.minimum(problem.lapses, FAR / 2) + SOON
+    in_time = arrives <= jnp.minimum(problem.lapses, FAR / 2)[None] + SOON
     return (open_targets(state) & before)[None] & helps & whole & in_time & free(state)[:, None]
 
 
@@ -129,7 +129,7 @@ def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array
         return (goal, choice, mask, todo & ~own, coming | (jnp.any(own) & (pick < targets))), None
 
     alone = jnp.zeros((agents, targets + 1), bool).at[:, targets].set(True)
-    coming = jnp.any(state.busy > 0)
+    coming = jnp.any((state.busy > 0) & state.problem.agent_mask)
     none = jnp.full(agents, targets, jnp.int32)
     start = (state.goal, none, alone, free(state), coming)
     (_, choice, mask, _, _), _ = jax.lax.scan(turn, start, None, agents)
