@@ -6,7 +6,7 @@ memory), L kinds of robots.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -17,11 +17,16 @@ import numpy.typing as npt
 from jax import Array
 
 from moonteam.grid.config import EnvConfig
+from moonteam.grid.macro import draw, world
+from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.grid.observe import observe
+from moonteam.grid.travel import distances, first_step
 from moonteam.grid.types import State
-from moonteam.policies import entity, recurrent
+from moonteam.policies import entity, pointer, recurrent
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.recurrent import RecurrentSpec
+from moonteam.problem.rules import UNREACHABLE
 
 
 class Mission(Protocol):
@@ -61,6 +66,11 @@ class Brain(Protocol):
         """Whether it reads travel fields where the ground is blocked."""
         ...
 
+    @property
+    def prefers(self) -> bool:
+        """Whether it takes a preference from time to effort."""
+        ...
+
     def slots(self, num_targets: int) -> int:
         """Target slots that it likes best; sizes between them need no compiling of their own."""
         ...
@@ -89,6 +99,7 @@ class RecurrentBrain:
 
     spec: RecurrentSpec
     travels = False
+    prefers = False
 
     def slots(self, num_targets: int) -> int:
         """Exactly those there are."""
@@ -136,6 +147,7 @@ class EntityBrain:
 
     spec: EntitySpec
     travels = True
+    prefers = True
 
     def slots(self, num_targets: int) -> int:
         """The next multiple of four; padding changes nothing."""
@@ -160,3 +172,76 @@ class EntityBrain:
         """See `Brain`: everything fits."""
         del mission
         return ""
+
+
+@dataclass(frozen=True)
+class PointerBrain:
+    """The network that points at targets, asked anew at every step; it has no memory.
+
+    At each moment all agents are free and choose among the targets; each chosen target's weight
+    is spread over the moves that shorten the way to it. Whole plans, in which a choice is held
+    until the target is solved, are made by `planners.macro` from the same network.
+    """
+
+    spec: PointerSpec
+    travels = True
+    prefers = True
+
+    def slots(self, num_targets: int) -> int:
+        """The next multiple of four; padding changes nothing."""
+        return -(-num_targets // 4) * 4
+
+    def begin(self, episodes: int, num_agents: int) -> tuple[()]:
+        """Nothing."""
+        del episodes, num_agents
+        return ()
+
+    def logits(self, params: Any, memory: tuple[()], states: State, fields: Array | None,
+               horizon: Array, preference: Array) -> tuple[tuple[()], Array]:
+        """See `Brain`; what is returned are log-probabilities."""
+
+        def moment(state: State, limit: Any, fields: Array | None) -> MacroState:
+            return world.reset(_by_target(state, limit, fields))
+
+        moments = jax.vmap(moment)(states, horizon, fields)
+        said = pointer.point(params, self.spec, jax.vmap(pointer.look)(moments, preference))
+        _, options = jax.vmap(world.choose)(moments, said.logits, jnp.zeros_like(said.logits))
+        weight = jax.nn.softmax(jnp.where(options, said.logits, -FAR), axis=-1)
+        return memory, jax.vmap(_moves)(states, fields, weight)
+
+    def misfit(self, mission: Mission) -> str:
+        """See `Brain`: everything fits."""
+        del mission
+        return ""
+
+
+def _by_target(state: State, limit: Array, fields: Array | None) -> MacroProblem:
+    """A moment of the world of steps, by the clock: what is left to do, everybody free."""
+    problem = state.problem
+    problem = replace(problem, target_mask=problem.target_mask & ~state.solved)
+    start = between = None
+    if fields is not None:
+        spots = problem.target_cells
+        ways = fields[:, :, spots[:, 1], spots[:, 0]]  # [L, M, M], from the last to the middle
+        between = _steps(jnp.swapaxes(ways, 1, 2)[problem.agent_kinds])
+        start = _steps(distances(problem, fields, state.cells))
+    return draw.of_grid(problem, state.cells, limit, start=start, between=between)
+
+
+def _steps(ways: Array) -> Array:
+    """Whole steps as the macro world takes them."""
+    return jnp.where(ways < UNREACHABLE, ways.astype(jnp.float32), FAR)
+
+
+def _moves(state: State, fields: Array | None, weight: Array) -> Array:
+    """[N, 5] log-probabilities of the moves, from the weight of each target and of waiting.
+
+    A target's weight goes evenly to the moves that shorten the way; underfoot it means stay.
+    """
+    there = distances(state.problem, fields, state.cells) < 1
+    toward = first_step(state.problem, fields, state.cells).astype(weight.dtype)  # [N, M, 4]
+    toward = toward / jnp.maximum(jnp.sum(toward, axis=-1, keepdims=True), 1.0)
+    going = jnp.einsum("nm,nma->na", weight[:, :-1], toward)
+    still = weight[:, -1] + jnp.sum(jnp.where(there, weight[:, :-1], 0.0), axis=-1)
+    pointed = jnp.concatenate([going, still[:, None]], axis=-1)
+    return jnp.log(jnp.clip(pointed, 1e-8, 1.0))

@@ -13,9 +13,10 @@ import msgspec
 
 from moonteam import paths
 from moonteam.errors import InputError
-from moonteam.policies import entity, policy_file, recurrent
-from moonteam.policies.brain import Brain, EntityBrain, Mission, RecurrentBrain
+from moonteam.policies import entity, pointer, policy_file, recurrent
+from moonteam.policies.brain import Brain, EntityBrain, Mission, PointerBrain, RecurrentBrain
 from moonteam.policies.entity import EntitySpec
+from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.recurrent import RecurrentSpec
 
 
@@ -37,7 +38,8 @@ class Policy:
         path = paths.find(os.fspath(path), "policies", ".safetensors")
         stored = policy_file.load_policy(path)
         kinds: dict[str, Any] = {"recurrent": (RecurrentSpec, RecurrentBrain, recurrent.init),
-                                 "entity": (EntitySpec, EntityBrain, entity.init)}
+                                 "entity": (EntitySpec, EntityBrain, entity.init),
+                                 "pointer": (PointerSpec, PointerBrain, pointer.init)}
         if stored.kind not in kinds:
             raise InputError(path, f"network kind {stored.kind!r} is not one of "
                              + ", ".join(kinds))

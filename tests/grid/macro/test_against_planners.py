@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from moonteam.grid.macro import world
+from moonteam.planners.macro import stacked
 from moonteam.planners.seconds.base import (
     MS,
     NEVER,
@@ -20,13 +21,23 @@ from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.seconds.macro import problem_of
 
-AGENTS, TARGETS, SKILLS = 3, 5, 3
+AGENTS, TARGETS = 3, 6
 reset, step = jax.jit(world.reset), jax.jit(world.step)
 
 
-def driven(now, services):
+@pytest.fixture(scope="module")
+def room(instances):
+    return instances.large(0, 3, 5, skills=3)
+
+
+def whole(now, room):
+    """The problem padded to the shape of the largest, so that all are compiled once."""
+    return jax.tree.map(lambda x: x[0], stacked([problem_of(now), problem_of(room)]))
+
+
+def driven(now, services, room):
     """Ends of the services (ms), makespan and effort as the macro world has them."""
-    state = reset(problem_of(now, AGENTS, TARGETS, SKILLS))
+    state = reset(whole(now, room))
     routes = [[one.target for one in in_order(services, a)] for a in range(len(now.present))]
     routes += [[]] * (AGENTS - len(routes))
     team = {one.target: one.agents[0] for one in services}
@@ -46,13 +57,13 @@ def driven(now, services):
     return bool(result.terminated), ends, MS * clock, MS * way
 
 
-def same(now, plan):
+def same(now, plan, room):
     """Checks one plan; whether there was one."""
     if plan.status == "infeasible" or not plan.services:
         return False
     assert problems(now, plan.services) == []
     services = timed_again(now, [(one.target, one.agents) for one in plan.services])
-    done, ends, span, way = driven(now, services)
+    done, ends, span, way = driven(now, services, room)
     assert done
     for one in services:
         assert ends[one.target] == pytest.approx(one.end, abs=0.6), one
@@ -63,16 +74,16 @@ def same(now, plan):
 
 @pytest.mark.parametrize("planner", [ExactPlanner(), ExactPlanner("effort"), GreedyPlanner()],
                          ids=["makespan", "effort", "greedy"])
-def test_a_plan_takes_as_long_in_both_worlds(planner, instances):
+def test_a_plan_takes_as_long_in_both_worlds(planner, instances, room):
     """Unlike speeds, tables with closed ways, services, coalitions, windows, chains, homes."""
     count = 0
     for seed in range(250):
         now = instances.instance(seed)
-        count += same(now, planner.plan(now))
+        count += same(now, planner.plan(now), room)
     assert count > 100
 
 
-def test_a_limit_and_a_window_can_be_met_to_the_millisecond(instances):
+def test_a_limit_and_a_window_can_be_met_to_the_millisecond(instances, room):
     count = 0
     for seed in range(60):
         now = instances.instance(seed)
@@ -84,10 +95,10 @@ def test_a_limit_and_a_window_can_be_met_to_the_millisecond(instances):
             lapses[one.target] = one.start
         last = max(one.end for one in plan.services)
         # The limit holds until everybody is home, in the macro world until all is served.
-        done, ends, _, _ = driven(replace(now, lapses=lapses, limit=last), plan.services)
+        done, ends, _, _ = driven(replace(now, lapses=lapses, limit=last), plan.services, room)
         assert done
         assert ends == {one.target: pytest.approx(one.end, abs=0.6) for one in plan.services}
-        done, *_ = driven(replace(now, limit=last - 1), plan.services)
+        done, *_ = driven(replace(now, limit=last - 1), plan.services, room)
         assert not done
         count += 1
     assert count > 20

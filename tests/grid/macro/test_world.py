@@ -98,7 +98,8 @@ def team(has, need, start, between, **changes):
     n, m = len(has), len(need)
     zero = np.zeros(m, np.float32)
     return replace(MacroProblem(
-        start=np.array(start, np.float32), between=np.tile(np.array(between, np.float32), (n, 1, 1)),
+        start=np.array(start, np.float32),
+        between=np.tile(np.array(between, np.float32), (n, 1, 1)),
         home=np.zeros((n, m), np.float32), home_now=np.zeros(n, np.float32), has=has, need=need,
         either=zero > 0, service=zero, after=np.zeros((m, m), bool), appears=zero, shown=zero,
         lapses=zero + FAR, free=np.zeros(n, np.float32), effort=np.ones(n, np.float32),

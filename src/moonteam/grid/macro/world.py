@@ -1,10 +1,10 @@
 """The rules of the macro world, as pure functions of one episode (vmap them over many).
 
 A decision is a target. An agent that is free chooses one, or to wait; it sets out at once and is
-bound until the target is solved. A service starts when the agents waiting at the target are the
-coalition that it needs, nobody bound to it is still on the way, the targets before it have ended
-and it has appeared; it ends `service` seconds later, and its agents are free again. Between events nothing is decided; at every event
-that leaves an agent free, all free agents choose, one after the other.
+bound until the target is solved. A service starts when all agents bound to the target wait there
+and are the coalition that it needs, the targets before it have ended and it has appeared; it ends
+`service` seconds later, and its agents are free again. Between events nothing is decided; at
+every event that leaves an agent free, all free agents choose, one after the other.
 
 Choices that lead nowhere are not allowed (see `allowed`), so that no two agents wait for each
 other for ever, whatever a policy says. Legend as in `types`.
@@ -194,16 +194,13 @@ def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
 
 
 def _start(state: MacroState) -> MacroState:
-    """Starts every service whose coalition waits."""
+    """Starts every service whose coalition waits, all that are bound to it."""
     problem = state.problem
     targets = problem.start.shape[1]
     waiting = (state.goal < targets) & (state.busy <= 0)
     there = jnp.where(waiting, state.goal, targets)
-    # Who is bound and still on the way is waited for, even where those there would do.
-    coming = (state.goal < targets) & (state.busy > 0)
-    awaited = jnp.any(jax.nn.one_hot(jnp.where(coming, state.goal, targets), targets, dtype=bool),
-                      axis=0)
-    met = jnp.all(missing(problem, there) == 0, axis=1) & ~awaited
+    coming = jax.nn.one_hot(jnp.where(waiting, targets, state.goal), targets, dtype=bool)
+    met = jnp.all(missing(problem, there) == 0, axis=1) & ~jnp.any(coming, axis=0)
     before = jnp.all(~problem.after | state.solved[None], axis=1)
     window = (state.now >= problem.appears - SOON) & (state.now <= problem.lapses + SOON)
     starts = open_targets(state) & met & before & window

@@ -1,0 +1,262 @@
+"""A pointing policy played out in the macro world: many problems, K tries of each, in one call.
+
+What planners in steps and by the clock have in common. A problem is a `MacroProblem` of NumPy
+arrays; `stacked` pads several to one of few shapes, `rollouts` plays them. All problems and tries
+share a pool of fixed size; a place whose episode has ended takes the next one, so that nobody
+waits for the longest. What an episode does depends on its problem, its number in the call, its
+try and the seed alone.
+
+Legend: B problems, K tries of each, E places of the pool, F episodes of a call (B * K), N agents,
+M targets, S skills.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from jax import Array
+
+from moonteam import trees
+from moonteam.errors import InputError
+from moonteam.grid.macro import world
+from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
+from moonteam.planners.decode import MOST_ROLLOUTS
+from moonteam.policies import pointer
+from moonteam.policies.brain import PointerBrain
+from moonteam.policies.pointer import PointerSpec
+from moonteam.policies.policy import Policy
+
+_PLACES = 256
+_PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of the network holds
+_CHUNK = 4096  # episodes of a call, more only if one problem's tries are
+_AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": "NS",
+         "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
+         "shown": "M", "lapses": "M", "free": "N", "effort": "N", "limit": "",
+         "agent_mask": "N", "target_mask": "M", "unit": ""}
+_PADDING = {"start": FAR, "between": FAR, "lapses": FAR}  # zero and False elsewhere
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """What every try did. Times in s (or the tables' unit) from the problem's time 0."""
+
+    solved: npt.NDArray[np.bool_]  # [B, K] every target within the problem's limit
+    seconds: npt.NDArray[np.float32]  # [B, K] until all are solved (and home); until it broke off
+    effort: npt.NDArray[np.float32]  # [B, K] weighted s of travel
+    order: npt.NDArray[np.int32]  # [B, K, N, M] decision at which it set out there; -1: never
+    start: npt.NDArray[np.float64]  # [B, K, M] s, of each target's service; nan: never served
+    end: npt.NDArray[np.float64]  # [B, K, M] s
+
+    @property
+    def team(self) -> npt.NDArray[np.bool_]:
+        """[B, K, M, N] who serves each target; nobody where it was never served."""
+        there = np.swapaxes(self.order >= 0, -1, -2)
+        return there & np.isfinite(self.start)[..., None]
+
+    def routes(self, problem: int, attempt: int = 0) -> npt.NDArray[np.int32]:
+        """[N, M] each agent's targets in order, then -1; those never served are left out.
+
+        No two agents wait for each other for ever.
+        """
+        order = self.order[problem, attempt]
+        served = np.isfinite(self.start[problem, attempt])
+        turn = np.where((order >= 0) & served, order, np.iinfo(np.int32).max)
+        route = np.argsort(turn, axis=1, kind="stable").astype(np.int32)
+        return np.where(np.sort(turn, axis=1) < np.iinfo(np.int32).max, route, -1)
+
+
+def spec_of(policy: Policy) -> PointerSpec:
+    """The network's size. Raises InputError if the policy does not point at targets."""
+    if not isinstance(policy.brain, PointerBrain):
+        raise InputError(policy.path, f"a network of kind {policy.source.kind} does not choose "
+                         "targets; one of kind pointer is needed")
+    return policy.brain.spec
+
+
+def padded(count: int) -> int:
+    """The size to which so many agents, targets or skills are padded: 1, 2, 3, 4, 6, 8, 12, .."""
+    if count <= 4:
+        return max(count, 1)
+    half = 1 << (count - 1).bit_length() - 1
+    return half * 3 // 2 if count <= half * 3 // 2 else half * 2
+
+
+def stacked(problems: Sequence[MacroProblem]) -> MacroProblem:
+    """[B] of problems of any sizes; NumPy arrays, padded to one of few shapes.
+
+    Many problems are padded to the largest of them, few to a size of `padded`.
+    """
+    size = (lambda count: max(count, 1)) if len(problems) > 64 else padded
+    shapes = [np.shape(p.has) + np.shape(p.service) for p in problems]  # N, S, M
+    agents, skills, targets = (size(max(column)) for column in zip(*shapes, strict=True))
+    whole = {"N": agents, "M": targets, "S": skills}
+
+    def column(name: str) -> np.ndarray:
+        axes = _AXES[name]
+        first = np.asarray(getattr(problems[0], name))
+        kind = np.float32 if first.dtype.kind == "f" else first.dtype
+        out = np.full((len(problems), *(whole[a] for a in axes)), _PADDING.get(name, 0), kind)
+        for i, one in enumerate(problems):
+            value = np.asarray(getattr(one, name))
+            out[(i, *(slice(length) for length in value.shape))] = value
+        return out
+
+    columns: dict[str, Any] = {name: column(name) for name in _AXES}
+    return MacroProblem(**columns)
+
+
+def unit_of(start: npt.NDArray, has: npt.NDArray, need: npt.NDArray) -> np.float32:
+    """The unit of time of `grid.macro.draw.unit_of`, on the host; start [N, M], need [M, S]."""
+    use = (has[:, None] & (need[None] > 0)).any(2) & (start < FAR)
+    mean = start[use].mean() if use.any() else 1.0
+    return np.float32(mean if mean > 0 else 1.0)
+
+
+def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: float = 0.0,
+             seed: int = 0, preference: float = 0.0,
+             tick: Callable[[int], object] = lambda episodes: None) -> Rollouts:
+    """Plays every problem `tries` times from its beginning to its end.
+
+    Args:
+      policy: of kind pointer.
+      problems: [B] NumPy arrays as from `stacked`.
+      tries: K.
+      heat: temperature at which choices are drawn; 0 takes the likeliest, and then all tries are
+        the same.
+      seed: of the draws.
+      preference: 0 time .. 1 effort.
+      tick: told how many episodes have ended, now and then.
+
+    Raises:
+      InputError: the policy is of another kind, or that is no number of tries.
+    """
+    spec = spec_of(policy)
+    if not 1 <= tries <= MOST_ROLLOUTS:
+        raise InputError("rollouts", f"{tries} is not allowed; 1 to {MOST_ROLLOUTS}")
+    count = len(problems.limit)
+    agents, targets = problems.start.shape[1:]
+    rows = 1 << (min(count, max(1, _CHUNK // tries)) - 1).bit_length()
+    places = max(1, min(_PLACES, _PAIRS // (agents + targets) ** 2, rows * tries))
+    parts = []
+    for first in range(0, count, rows):
+        index = np.arange(first, first + rows)
+        part = jax.tree.map(lambda x, i=index: x[np.minimum(i, count - 1)], problems)
+        real = min(rows, count - first)
+        done = _play(spec, policy.params, part, np.int32(real * tries), np.int32(first),
+                     np.float32(heat), np.uint32(seed % 2**32), np.float32(preference), tries,
+                     places)
+        done = jax.device_get(done)
+        parts.append(jax.tree.map(lambda x, n=real: x.reshape(rows, tries, *x.shape[1:])[:n],
+                                  done))
+        tick(real * tries)
+    whole: _Done = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    start, end = _times(problems, whole)
+    return Rollouts(whole.solved, whole.seconds, whole.effort, whole.order, start, end)
+
+
+class _Done(NamedTuple):
+    """What the episodes did; [F], or [E] while they are under way."""
+
+    solved: Any
+    seconds: Any
+    effort: Any
+    order: Any  # [., N, M] int32
+    arrival: Any  # [., N, M] s at which an agent is at a target that it set out for
+    served: Any  # [., M] bool
+
+
+class _Pool(NamedTuple):
+    episode: Array  # [E] int32; those past the last stand still
+    state: MacroState  # [E]
+    turn: Array  # [E] int32, decisions so far
+    log: _Done  # [E]
+    done: _Done  # [F]
+    following: Array  # [] int32, the next episode
+
+
+@partial(jax.jit, static_argnames=("spec", "tries", "places"))
+def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, first: Array,
+          heat: Array, seed: Array, preference: Array, tries: int, places: int) -> _Done:
+    """The first `count` of the episodes [F]; `first` is the number of the first problem."""
+    rows = problems.limit.shape[0]
+    agents, targets = problems.start.shape[1:]
+    key = jax.random.key(seed)
+    likings = jnp.broadcast_to(preference, (places,))
+
+    def blank(size: int) -> _Done:
+        shape = (size, agents, targets)
+        none = jnp.zeros(size)
+        return _Done(none > 0, none, none, jnp.full(shape, -1, jnp.int32), jnp.zeros(shape),
+                     jnp.zeros((size, targets), bool))
+
+    def fresh(episode: Array) -> MacroState:
+        row = jnp.minimum(episode // tries, rows - 1)
+        return jax.vmap(world.reset)(jax.tree.map(lambda x: x[row], problems))
+
+    def noise(episode: Array, turn: Array) -> Array:
+        own = jax.random.fold_in(jax.random.fold_in(key, first + episode // tries),
+                                 episode % tries)
+        return jax.random.gumbel(jax.random.fold_in(own, turn), (agents, targets + 1))
+
+    def decide(pool: _Pool) -> _Pool:
+        state, log = pool.state, pool.log
+        view = jax.vmap(pointer.look)(state, likings)
+        logits = pointer.point(params, spec, view).logits
+        drawn = heat * jax.vmap(noise)(pool.episode, pool.turn)
+        choice, _ = jax.vmap(world.choose)(state, logits, drawn)
+        result = jax.vmap(world.step)(state, choice)
+        log = _written(log, state, choice, pool.turn, result.effort)
+        after = result.state
+        over = (result.terminated | result.truncated) & (pool.episode < count)
+        end = state.now + result.seconds
+        solved = result.terminated & (end <= state.problem.limit + world.SOON)
+        log = log._replace(solved=solved, seconds=end, served=after.solved | after.serving)
+        at = jnp.where(over, pool.episode, rows * tries)
+        done = jax.tree.map(lambda all_, own: all_.at[at].set(own, mode="drop"), pool.done, log)
+        taken = pool.following + jnp.cumsum(over) - 1
+        episode = jnp.where(over, taken, pool.episode).astype(jnp.int32)
+        log, after = trees.where(over, (blank(places), fresh(episode)), (log, after))
+        return _Pool(episode, after, jnp.where(over, 0, pool.turn + 1), log, done,
+                     pool.following + jnp.sum(over, dtype=jnp.int32))
+
+    everyone = jnp.arange(places, dtype=jnp.int32)
+    begun = _Pool(everyone, fresh(everyone), jnp.zeros(places, jnp.int32), blank(places),
+                  blank(rows * tries), jnp.int32(places))
+    return jax.lax.while_loop(lambda pool: jnp.any(pool.episode < count), decide, begun).done
+
+
+def _written(log: _Done, state: MacroState, choice: Array, turn: Array, effort: Array) -> _Done:
+    """The log with who set out, and when each will be there."""
+    targets = log.served.shape[1]
+    going = jax.nn.one_hot(choice, targets, dtype=bool) & jax.vmap(world.free)(state)[:, :, None]
+    legs = jax.vmap(world.legs)(state.problem, state.node)
+    order = jnp.where(going, turn[:, None, None], log.order)
+    arrival = jnp.where(going, state.now[:, None, None] + legs, log.arrival)
+    return log._replace(order=order, arrival=arrival, effort=log.effort + effort)
+
+
+def _times(problems: MacroProblem, done: _Done) -> tuple[Any, Any]:
+    """[B, K, M] start and end of every service: when all are there and what is before has ended.
+
+    As the world's rules say; made anew from the arrivals, for several services may start and
+    end between two decisions.
+    """
+    there = np.where(done.order >= 0, done.arrival, 0.0).astype(np.float64).max(2)
+    start = np.maximum(there, problems.appears[:, None])
+    service = problems.service[:, None].astype(np.float64)
+    after = problems.after[:, None]  # [B, 1, M, M]
+    while after.any():
+        later = np.where(after, (start + service)[:, :, None], 0.0).max(-1)
+        if (later <= start).all():
+            break
+        start = np.maximum(start, later)
+    served = done.served & problems.target_mask[:, None]
+    start = np.where(served, start, np.nan)
+    return start, start + service
