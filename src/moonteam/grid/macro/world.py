@@ -90,7 +90,7 @@ def allowed(state: MacroState, goal: Array) -> Array:
     sure = state.solved | state.serving | (complete & problem.target_mask)
     before = jnp.all(~problem.after | sure[None], axis=1)  # [M]
     arrives = state.now + legs(problem, state.node)
-    in_time = arrives <= jnp.minimum(problem.lapses, FAR / 2) + SOON
+    in_time = arrives <= jnp.minimum(problem.lapses, FAR / 2)[None] + SOON
     return (open_targets(state) & before)[None] & helps & whole & in_time & free(state)[:, None]
 
 
@@ -129,7 +129,7 @@ def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array
         return (goal, choice, mask, todo & ~own, coming | (jnp.any(own) & (pick < targets))), None
 
     alone = jnp.zeros((agents, targets + 1), bool).at[:, targets].set(True)
-    coming = jnp.any(state.busy > 0)
+    coming = jnp.any((state.busy > 0) & state.problem.agent_mask)
     none = jnp.full(agents, targets, jnp.int32)
     start = (state.goal, none, alone, free(state), coming)
     (_, choice, mask, _, _), _ = jax.lax.scan(turn, start, None, agents)
@@ -157,8 +157,7 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     end = jnp.maximum(jnp.max(jnp.where(problem.agent_mask, after.since + way, 0.0)), after.now)
     end = jnp.where(done, end, after.now)
     effort = jnp.sum(problem.effort * (leg + jnp.where(done, way, 0.0)))
-    return MacroResult(after, end - state.now, effort, done,
-                       ~done & (dead | (after.now >= problem.limit - SOON)))
+    return MacroResult(after, end - state.now, effort, done, ~done & dead)
 
 
 def _way_home(state: MacroState) -> Array:
@@ -178,9 +177,8 @@ def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
     """
     def waits(carry: tuple) -> Array:
         state, dead, moved = carry
-        over = jnp.all(state.solved) | (state.now >= state.problem.limit - SOON)
         decide = moved & jnp.any(free(state)) & jnp.any(open_targets(state))
-        return ~(over | dead | decide)
+        return ~(jnp.all(state.solved) | dead | decide)
 
     def event(carry: tuple) -> tuple:
         state, _, _ = carry
@@ -217,7 +215,7 @@ def _start(state: MacroState) -> MacroState:
 
 
 def _advance(state: MacroState) -> tuple[MacroState, Array]:
-    """To the next event; and whether there is none."""
+    """To the next event; and whether there is none, or none before the limit."""
     problem = state.problem
     targets = problem.start.shape[1]
     arrivals = jnp.where((state.busy > 0) & problem.agent_mask, state.busy, FAR)
@@ -230,7 +228,10 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)), jnp.min(news))
     late = ~state.solved & ~state.serving & (state.now > problem.lapses + SOON)
     dead = (wait >= FAR / 2) | jnp.any(late)
-    wait = jnp.where(dead, 0.0, jnp.minimum(wait, jnp.maximum(problem.limit - state.now, 0.0)))
+    left = jnp.maximum(problem.limit - state.now, 0.0)
+    over = wait > left + SOON
+    wait = jnp.where(dead, 0.0, jnp.where(over, left, wait))
+    dead = dead | over
     busy = state.busy - wait
     busy = jnp.where(busy <= SOON, 0.0, busy)
     now = state.now + wait
