@@ -17,26 +17,29 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
 from moonteam import trees
 from moonteam.grid.macro import world
-from moonteam.grid.macro.draw import Draw, draw
-from moonteam.grid.macro.types import FAR, MacroState
+from moonteam.grid.macro.draw import Draw, asking, draw, paces
+from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.policies.pointer import Outlook, PointerSpec, look, point
 from training.mappo.gae import advantages
+from training.mappo.macro.grounds import at_pace
+
+AXIS = "batch"
+"""Of the mesh, see `training.sharding`."""
 
 
 @dataclass(frozen=True)
 class Hyper:
     """What an update needs to know; static under jit."""
 
-    num_envs: int = 512
-    """E, environments side by side."""
     num_steps: int = 16
-    """T, decisions of each between updates."""
-    epochs: int = 2
+    """T, decisions of each environment between updates."""
+    epochs: int = 1
     """Passes over what was collected."""
-    minibatches: int = 8
+    minibatches: int = 16
     """Parts of a pass."""
     gae_lambda: float = 0.95
     """Of generalised advantage estimation; the discount is 1."""
@@ -82,6 +85,13 @@ class Learner(NamedTuple):
     params: Any
     mean: Any  # running mean of the parameters
     optimiser: optax.OptState
+    steps: Array  # [] int32, gradient steps made
+
+    @classmethod
+    def begin(cls, params: Any, hyper: Hyper) -> Learner:
+        """Copies of the parameters, since a learner is donated, and a fresh optimiser."""
+        params, mean = jax.tree.map(jnp.array, params), jax.tree.map(jnp.array, params)
+        return cls(params, mean, optimiser(hyper).init(params), jnp.zeros((), jnp.int32))
 
 
 class Report(NamedTuple):
@@ -95,10 +105,20 @@ class Report(NamedTuple):
     episodes: Array
 
 
-def fresh(family: Draw, hyper: Hyper, key: Array, count: int) -> Walk:
-    """New episodes at their start."""
+def fresh(family: Draw, hyper: Hyper, ground: MacroProblem | None, key: Array,
+          count: int) -> Walk:
+    """New episodes at their start, on open maps or drawn from `ground` [P]."""
     key, wish = jax.random.split(key)
-    states = jax.vmap(lambda k: world.reset(draw(family, k)))(jax.random.split(key, count))
+
+    def one(key: Array) -> MacroState:
+        if ground is None:
+            return world.reset(draw(family, key))
+        which, pace, more = jax.random.split(key, 3)
+        place = jax.random.randint(which, (), 0, ground.limit.shape[0])
+        problem = at_pace(jax.tree.map(lambda x: x[place], ground), paces(family, pace))
+        return world.reset(asking(family, problem, more))
+
+    states = jax.vmap(one)(jax.random.split(key, count))
     prefer = jnp.zeros(count)
     if hyper.spread:  # a quarter each at the two ends of the preference, the rest in between
         prefer = jnp.clip(jax.random.uniform(wish, (count,), minval=-0.5, maxval=1.5), 0.0, 1.0)
@@ -119,12 +139,11 @@ def chosen(logits: Array, options: Array, choice: Array) -> tuple[Array, Array]:
     return taken, entropy
 
 
-def collect(spec: PointerSpec, family: Draw, hyper: Hyper, params: Any, walk: Walk,
-            key: Array) -> tuple[Walk, Rows, Array, Array]:
+def collect(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem | None,
+            params: Any, walk: Walk, key: Array) -> tuple[Walk, Rows, Array, Array]:
     """T decisions of every environment; the value after them; lengths of ended episodes."""
     pool_key, key = jax.random.split(key)
-    count = hyper.num_envs
-    pool = fresh(family, hyper, pool_key, count)
+    pool = fresh(family, hyper, ground, pool_key, walk.preference.shape[0])
 
     def see(walk: Walk) -> Outlook:
         return jax.vmap(look)(walk.states, walk.preference)
@@ -184,50 +203,67 @@ def loss(params: Any, spec: PointerSpec, hyper: Hyper, batch: Batch,
         [spread, critic, clipped])
 
 
-def update(spec: PointerSpec, family: Draw, hyper: Hyper, learner: Learner, walk: Walk, key: Array,
-           lr: Array, entropy_weight: Array) -> tuple[Learner, Walk, Report]:
-    """Collect, then improve."""
-    collect_key, order_key = jax.random.split(key)
-    walk, rows, last, lengths = collect(spec, family, hyper, learner.params, walk, collect_key)
+def update(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem | None,
+           learner: Learner, walk: Walk, key: Array, lr: Array,
+           entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+    """Collect, then improve; inside `several`, on each device with its own environments."""
+    collect_key, order_key = jax.random.split(jax.random.fold_in(key, jax.lax.axis_index(AXIS)))
+    walk, rows, last, lengths = collect(spec, family, hyper, ground, learner.params, walk,
+                                        collect_key)
     following = jnp.concatenate([rows.value[1:], last[None]])
     # A cut-off episode has paid for what it left: an end like any other.
     gain = advantages(rows.reward, rows.value, following, rows.ended, jnp.zeros_like(rows.ended),
                       1.0, hyper.gae_lambda)
     target = gain + rows.value
-    gain = (gain - gain.mean()) / (gain.std() + 1e-6)
+    mean = jax.lax.pmean(gain.mean(), AXIS)
+    gain = (gain - mean) / (jnp.sqrt(jax.lax.pmean(((gain - mean) ** 2).mean(), AXIS)) + 1e-6)
     batch = Batch(rows.view, rows.choice, rows.options, rows.log_prob, gain, target)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
-    total = hyper.num_envs * hyper.num_steps
     rule = optimiser(hyper)
 
     def improve(learner: Learner, index: Array) -> tuple[Learner, Array]:
         part = jax.tree.map(lambda x: x[index], flat)
         (_, said), slope = jax.value_and_grad(loss, has_aux=True)(
             learner.params, spec, hyper, part, entropy_weight)
-        way, state = rule.update(slope, learner.optimiser)
+        way, state = rule.update(jax.lax.pmean(slope, AXIS), learner.optimiser)
         params = jax.tree.map(lambda p, w: p - lr * w, learner.params, way)
-        mean = jax.tree.map(lambda m, p: hyper.ema * m + (1 - hyper.ema) * p, learner.mean, params)
-        return Learner(params, mean, state), said
+        # Young, the mean must not remember how it began.
+        count = learner.steps.astype(jnp.float32)
+        keep = jnp.minimum(hyper.ema, (1.0 + count) / (10.0 + count))
+        mean = jax.tree.map(lambda m, p: keep * m + (1.0 - keep) * p, learner.mean, params)
+        return Learner(params, mean, state, learner.steps + 1), said
 
-    order = jax.vmap(lambda k: jax.random.permutation(k, total))(
+    order = jax.vmap(lambda k: jax.random.permutation(k, gain.size))(
         jax.random.split(order_key, hyper.epochs))
     learner, said = jax.lax.scan(improve, learner,
                                  order.reshape(hyper.epochs * hyper.minibatches, -1))
-    episodes = jnp.sum(rows.ended)
+    episodes, solved, length = jax.lax.psum(
+        (jnp.sum(rows.ended), jnp.sum(rows.ended & ~rows.truncated), jnp.sum(lengths)), AXIS)
     count = jnp.maximum(episodes, 1)
-    spread, critic, clipped = said.mean(axis=0)
-    return learner, walk, Report(
-        jnp.sum(rows.ended & ~rows.truncated) / count, jnp.sum(lengths) / count, spread, critic,
-        clipped, episodes)
+    spread, critic, clipped = jax.lax.pmean(said.mean(axis=0), AXIS)
+    return learner, walk, Report(solved / count, length / count, spread, critic, clipped, episodes)
 
 
-@partial(jax.jit, static_argnames=("spec", "family", "hyper"), donate_argnames=("learner", "walk"))
-def several(spec: PointerSpec, family: Draw, hyper: Hyper, learner: Learner, walk: Walk,
-            keys: Array, lr: Array, entropy_weight: Array) -> tuple[Learner, Walk, Report]:
-    """One update for each of `keys`, `lr` and `entropy_weight` [U]."""
-    def one(carry: tuple[Learner, Walk], at: tuple) -> tuple[tuple[Learner, Walk], Report]:
-        learner, walk, report = update(spec, family, hyper, *carry, *at)
-        return (learner, walk), report
+@partial(jax.jit, static_argnames=("mesh", "spec", "family", "hyper"),
+         donate_argnames=("learner", "walk"))
+def several(mesh: Mesh, spec: PointerSpec, family: Draw, hyper: Hyper,
+            ground: MacroProblem | None, learner: Learner, walk: Walk, keys: Array, lr: Array,
+            entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+    """One update for each of `keys`, `lr` and `entropy_weight` [U].
 
-    (learner, walk), reports = jax.lax.scan(one, (learner, walk), (keys, lr, entropy_weight))
-    return learner, walk, reports
+    The environments are shared out over the devices of `mesh`; gradients are the mean of theirs.
+    """
+    def all_of_them(ground: MacroProblem | None, learner: Learner, walk: Walk, keys: Array,
+                    lr: Array, entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+        def one(carry: tuple[Learner, Walk], at: tuple) -> tuple[tuple[Learner, Walk], Report]:
+            learner, walk, report = update(spec, family, hyper, ground, *carry, *at)
+            return (learner, walk), report
+
+        (learner, walk), reports = jax.lax.scan(one, (learner, walk), (keys, lr, entropy_weight))
+        return learner, walk, reports
+
+    whole, shared = PartitionSpec(), PartitionSpec(AXIS)
+    return jax.shard_map(
+        all_of_them, mesh=mesh, in_specs=(whole, whole, shared, whole, whole, whole),
+        out_specs=(whole, shared, whole), check_vma=False)(
+            ground, learner, walk, keys, lr, entropy_weight)

@@ -5,7 +5,8 @@ Legend as in `types`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +81,11 @@ def of_grid(problem: Problem, cells: Array, limit: Array | float, metric: Metric
 
 @dataclass(frozen=True)
 class Draw:
-    """A family of random problems of the macro world; hashable."""
+    """A family of random problems of the macro world; hashable.
+
+    Skills, coalitions and places are those of the grid's own sampling (`grid.sampling`), made
+    harder by what is asked for here.
+    """
 
     agents: tuple[int, int] = (3, 3)
     """Fewest and most robots."""
@@ -90,10 +95,19 @@ class Draw:
     """Skills that exist."""
     sides: tuple[int, int] = (32, 32)
     """Smallest and largest side of the square map, cells."""
-    metric: Metric = "manhattan"
-    """Of the ways."""
+    metric: Metric | Literal["either"] = "manhattan"
+    """Of the ways; either: half of the problems each."""
     speeds: tuple[float, ...] = (1.0,)
     """Cells a second that a robot may have; each draws one."""
+    unlike: float = 0.0
+    """Share of problems in which every robot draws a speed of its own, from 0.2 to 1 and even in
+    its logarithm, instead."""
+    service: float = 0.0
+    """Longest service, in usual ways; in half of the problems there is none."""
+    numbers: int = 1
+    """Most agents that a target of a single skill may need, in half of the problems."""
+    homes: float = 0.0
+    """Share of problems in which every robot has to be back where it started."""
     limit: float = 128.0
     """s in which everything must be done."""
 
@@ -106,11 +120,49 @@ class Draw:
 
 def draw(family: Draw, key: Array) -> MacroProblem:
     """One random problem."""
-    many, pose, size, pace, team = jax.random.split(key, 5)
+    many, team, size, pose, pace, ways, more = jax.random.split(key, 7)
     count = jax.random.randint(many, (), family.targets[0], family.targets[1] + 1)
     number = jax.random.randint(team, (), family.agents[0], family.agents[1] + 1)
     side = jax.random.randint(size, (), family.sides[0], family.sides[1] + 1)
     problem, cells = sample(family.config, pose, number, count, jnp.stack([side, side]))
-    speeds = jnp.asarray(family.speeds)
-    speed = speeds[jax.random.randint(pace, (family.agents[1],), 0, len(family.speeds))]
-    return of_grid(problem, cells, family.limit, family.metric, speed, family.num_skills)
+    speed = paces(family, pace)
+    if family.metric == "either":
+        made = [of_grid(problem, cells, family.limit, metric, speed, family.num_skills)
+                for metric in ("manhattan", "straight")]
+        straight = jax.random.bernoulli(ways)
+        made = jax.tree.map(lambda a, b: jnp.where(straight, b, a), *made)
+    else:
+        made = of_grid(problem, cells, family.limit, family.metric, speed, family.num_skills)
+    return asking(family, made, more)
+
+
+def paces(family: Draw, key: Array) -> Array:
+    """[N] cells a second."""
+    listed, own, which = jax.random.split(key, 3)
+    shape = (family.agents[1],)
+    speeds = jnp.asarray(family.speeds)[jax.random.randint(listed, shape, 0, len(family.speeds))]
+    if not family.unlike:
+        return speeds
+    unlike = jnp.exp(jax.random.uniform(own, shape, minval=jnp.log(0.2), maxval=0.0))
+    return jnp.where(jax.random.bernoulli(which, family.unlike), unlike, speeds)
+
+
+def asking(family: Draw, problem: MacroProblem, key: Array) -> MacroProblem:
+    """The problem with services, coalitions by number and homes, as the family asks."""
+    length, some, team, many, home = jax.random.split(key, 5)
+    targets = problem.start.shape[1]
+    if family.service:
+        longest = family.service * problem.unit * jax.random.bernoulli(some)
+        problem = replace(problem, service=longest * jax.random.uniform(length, (targets,)))
+    if family.numbers > 1:
+        able = problem.has & problem.agent_mask[:, None]
+        have = jnp.sum(jnp.where(problem.need > 0, jnp.sum(able, axis=0)[None], 0), axis=1)  # [M]
+        wanted = jax.random.randint(many, (targets,), 1, family.numbers + 1)
+        wanted = jnp.where(jax.random.bernoulli(team), jnp.clip(wanted, 1, have), 1)
+        single = jnp.sum(problem.need > 0, axis=1) == 1
+        need = jnp.where(single[:, None], problem.need * wanted[:, None], problem.need)
+        problem = replace(problem, need=need, either=problem.either & ~(single & (wanted > 1)))
+    if family.homes:
+        back = jax.random.bernoulli(home, family.homes)
+        problem = replace(problem, home=jnp.where(back & (problem.start < FAR), problem.start, 0.0))
+    return problem

@@ -1,0 +1,122 @@
+"""What a MAPPO run on macro-decisions is made of, and the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from moonteam.errors import InputError
+from moonteam.grid.macro.draw import Draw
+from moonteam.policies.pointer import PointerSpec
+from training.mappo.macro.update import Hyper
+
+
+@dataclass(frozen=True)
+class Practice:
+    """Problems of one family, and how much of them."""
+
+    name: str
+    """For tables and curves."""
+    draw: Draw
+    """What is drawn."""
+    grounds: int = 0
+    """P, maps with blocked cells made beforehand and drawn from; 0: open maps."""
+    shrink: int = 1
+    """Environments are this many times fewer: large problems cost more."""
+
+
+@dataclass(frozen=True)
+class MacroConfig:
+    """A whole run; every round makes one update on each family."""
+
+    macro: str
+    """The preset these numbers started from."""
+    families: tuple[Practice, ...]
+    """What is practised, each round on all of them."""
+    rounds: int
+    """Rounds of collecting and improving."""
+    num_envs: int = 512
+    """E, environments of each family."""
+    hyper: Hyper = field(default_factory=Hyper)
+    """Of an update."""
+    spec: PointerSpec = field(default_factory=PointerSpec)
+    """Size of the network."""
+    lr: float = 1e-3
+    """Learning rate at the start; falls linearly to a twentieth."""
+    ent_coef: float = 0.01
+    """Entropy bonus at the start; falls linearly to 0 at five sixths of the run."""
+    seed: int = 0
+    """Seed of everything random in training."""
+    chunk_rounds: int = 5
+    """Rounds between two looks from outside (logging, checkpoint, signals)."""
+    eval_every: int = 4
+    """Chunks between evaluations on held-out scenarios."""
+    eval_scenarios: int = 256
+    """Held-out scenarios of each family; fewer of one that shrinks."""
+
+    def __post_init__(self) -> None:
+        self.spec.check(self.macro)
+        for key in ("rounds", "num_envs", "chunk_rounds", "eval_every", "eval_scenarios"):
+            if getattr(self, key) < 1:
+                raise InputError(self.macro, f"{getattr(self, key)} is not allowed; at least 1",
+                                 key)
+        for key in ("num_steps", "epochs", "minibatches"):
+            if getattr(self.hyper, key) < 1:
+                raise InputError(self.macro, f"{getattr(self.hyper, key)} is not allowed; at "
+                                 "least 1", f"hyper.{key}")
+        if not 0.0 < self.lr <= 0.1:
+            raise InputError(self.macro, f"{self.lr:g} is not allowed; above 0, at most 0.1", "lr")
+        for one in self.families:
+            decisions = self.envs(one) * self.hyper.num_steps
+            if self.envs(one) < 1 or decisions % self.hyper.minibatches:
+                raise InputError(
+                    self.macro, f"{self.hyper.minibatches} minibatches do not divide "
+                    f"{self.envs(one)} environments x {self.hyper.num_steps} decisions of "
+                    f"{one.name}", "hyper.minibatches")
+
+    def envs(self, family: Practice) -> int:
+        """Environments of a family."""
+        return self.num_envs // family.shrink
+
+    @property
+    def decisions(self) -> int:
+        """Moments decided in a round, of all families."""
+        return sum(self.envs(f) * self.hyper.num_steps for f in self.families)
+
+
+PAPER = Practice("3 robots, 5 to 7 targets", Draw())
+SECONDS = Practice("3 unlike robots, 5 to 7 targets, straight",
+                   Draw(metric="straight", speeds=(1.5, 0.36, 0.47), limit=1200.0))
+
+PRESETS = {
+    "quick": MacroConfig("quick", (PAPER,), rounds=140),
+    "paper": MacroConfig("paper", (PAPER,), rounds=900),
+    "any_team": MacroConfig(
+        "any_team", (
+            PAPER,
+            Practice("3 unlike robots, 1 to 8 targets",
+                     Draw(targets=(1, 8), metric="either", unlike=0.8, service=1.0, numbers=2,
+                          homes=0.2, sides=(16, 48), limit=4000.0), shrink=2),
+            Practice("2 to 4 robots, 3 to 9 targets, 3 skills",
+                     Draw(agents=(2, 4), targets=(3, 9), num_skills=3, sides=(8, 64),
+                          metric="either", unlike=0.3, limit=4000.0), shrink=2),
+            Practice("3 or 4 robots, 4 to 7 targets, blocked",
+                     Draw(agents=(3, 3), targets=(4, 7), num_skills=2, unlike=0.3,
+                          limit=4000.0), grounds=2048, shrink=2),
+            Practice("4 to 6 robots, 8 to 12 targets",
+                     Draw(agents=(4, 6), targets=(8, 12), sides=(16, 40), metric="either",
+                          unlike=0.3, limit=4000.0), shrink=4),
+            Practice("5 to 8 robots, 12 to 24 targets",
+                     Draw(agents=(5, 8), targets=(12, 24), num_skills=3, metric="either",
+                          unlike=0.3, limit=8000.0), shrink=8),
+            Practice("6 to 8 robots, 24 to 40 targets",
+                     Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
+                          limit=8000.0), shrink=16),
+        ), rounds=900, hyper=Hyper(spread=True)),
+}
+
+
+def preset(name: str) -> MacroConfig:
+    """The preset of that name. Raises InputError listing the names."""
+    if name not in PRESETS:
+        raise InputError(name, f"no such preset; one of: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,78 @@
+"""How a pointing policy under training does on problems that training never draws.
+
+Legend: E problems of a family, N agents, M targets.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+import numpy.typing as npt
+
+from moonteam.grid.macro.types import FAR, MacroProblem
+from moonteam.planners.macro import rollouts
+from moonteam.planners.seconds.base import MS, NEVER, Moment
+from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.planners.seconds.local import LocalSearchPlanner
+from moonteam.policies.policy import Policy
+from training.mappo.held_out import HELD_OUT_SEED
+from training.mappo.macro import grounds
+from training.mappo.macro.config import Practice
+from training.mappo.macro.update import Hyper, fresh
+
+EXACT_TO = 8
+"""Targets up to which the optimum is certified; beyond, it is the best that search finds."""
+MOVES = 20_000
+"""Of that search."""
+
+
+def moment_of(problem: MacroProblem) -> Moment:
+    """One problem (host arrays) in whole milliseconds, as the planners by the clock take it."""
+    agents, targets = problem.start.shape
+    return Moment(
+        start=_ms(problem.start), between=_ms(problem.between), home=_ms(problem.home),
+        home_now=_ms(problem.home_now), classes=np.arange(agents), has=np.asarray(problem.has),
+        need=np.asarray(problem.need, np.int64), either=np.asarray(problem.either),
+        service=_ms(problem.service), after=np.asarray(problem.after),
+        appears=_ms(problem.appears), lapses=_ms(problem.lapses), free=_ms(problem.free),
+        present=np.asarray(problem.agent_mask), solved=~np.asarray(problem.target_mask),
+        ends=np.zeros(targets, np.int64), effort=np.asarray(problem.effort, np.float64))
+
+
+def _ms(seconds: Any) -> npt.NDArray[np.int64]:
+    times = np.asarray(seconds, np.float64)
+    return np.where(times >= FAR / 2, NEVER, np.round(times * MS)).astype(np.int64)
+
+
+class HeldOut:
+    """Problems of one family, with their optima."""
+
+    def __init__(self, family: Practice, count: int):
+        """Draws them and plans each once, exactly or nearly."""
+        self.family = family
+        ground = grounds.make(family.draw, count, HELD_OUT_SEED) if family.grounds else None
+        key = jax.random.key(HELD_OUT_SEED)
+        walk = jax.jit(lambda k: fresh(family.draw, Hyper(), ground, k, count))(key)
+        self.problems: MacroProblem = jax.device_get(walk.states.problem)
+        each = [moment_of(jax.tree.map(lambda x, i=i: x[i], self.problems)) for i in range(count)]
+        spans = [_best(one) for one in each]
+        known = [span is not None for span in spans]  # all of them, but for closed-off ground
+        self.problems = jax.tree.map(lambda x: x[np.array(known)], self.problems)
+        self.best = np.array([span / MS for span in spans if span is not None])
+
+    def score(self, policy: Policy) -> dict[str, Any]:
+        """Success and mean gap of the makespan by argmax; failures count with the limit."""
+        done = rollouts(policy, self.problems)
+        solved = done.solved[:, 0]
+        seconds = np.where(solved, done.seconds[:, 0], self.problems.limit)
+        return {"family": self.family.name, "success": float(solved.mean()),
+                "makespan_gap": float(seconds.mean() / self.best.mean() - 1.0)}
+
+
+def _best(moment: Moment) -> int | None:
+    few = int((~moment.solved).sum()) <= EXACT_TO
+    return (ExactPlanner() if few else LocalSearchPlanner(iterations=MOVES)).plan(moment).makespan
+
+

@@ -1,0 +1,199 @@
+"""MAPPO on macro-decisions, as something that a run trains; see `training.run`."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from moonteam.policies import pointer
+from moonteam.policies.brain import PointerBrain
+from moonteam.policies.policy import Policy
+from moonteam.policies.policy_file import PolicyFile
+from training.mappo.macro import grounds
+from training.mappo.macro.config import MacroConfig
+from training.mappo.macro.curve import draw_curve
+from training.mappo.macro.held_out import HeldOut
+from training.mappo.macro.update import Learner, Report, Walk, fresh, several
+from training.run.trainee import Made, Position, Row
+from training.sharding import everywhere, gather, mesh_for, spread
+
+PHASE = "macro"
+
+
+class Held(NamedTuple):
+    """All that a resumed run needs; what is drawn descends from seed and round."""
+
+    learner: Learner
+    walks: list[Walk]
+
+
+class MacroMappo:
+    """A run in progress; `learner.mean` is the policy. A `training.run.trainee.Trainee`."""
+
+    unit = "round"
+
+    def __init__(self, config: MacroConfig, params: Any = None, source: str = ""):
+        """Makes grounds and environments from the config's seed, parameters too if not given."""
+        self.config, self.name, self.seed, self.source = config, config.macro, config.seed, source
+        parts = config.hyper.minibatches
+        self.mesh = mesh_for([config.envs(f) for f in config.families]
+                             + [config.envs(f) * config.hyper.num_steps // parts
+                                for f in config.families])
+        key = jax.random.key(config.seed)
+        keys = jax.random.split(key, len(config.families) + 1)
+        params = pointer.init(config.spec, keys[0]) if params is None else params
+        self.learner = everywhere(self.mesh, Learner.begin(params, config.hyper))
+        self.grounds = [everywhere(self.mesh, grounds.make(f.draw, f.grounds, config.seed + i))
+                        if f.grounds else None for i, f in enumerate(config.families)]
+        self.walks = [
+            spread(self.mesh, jax.jit(partial(fresh, f.draw, config.hyper, count=config.envs(f)))(
+                ground, k))
+            for f, ground, k in zip(config.families, self.grounds, keys[1:], strict=True)]
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """All numbers of the run."""
+        numbers = {"method": "MAPPO on macro-decisions", **dataclasses.asdict(self.config)}
+        return numbers | ({"source": self.source} if self.source else {})
+
+    @property
+    def network(self) -> dict[str, Any]:
+        """Size of the network."""
+        return dataclasses.asdict(self.config.spec)
+
+    @property
+    def phases(self) -> tuple[tuple[str, int], ...]:
+        """One."""
+        return ((PHASE, self.config.rounds),)
+
+    @property
+    def env_steps(self) -> int:
+        """Decisions of the whole run."""
+        return self.config.rounds * self.config.decisions
+
+    def enter(self, phase: str) -> None:
+        """There is no other."""
+        assert phase == PHASE
+
+    def chunk(self, at: Position) -> Made:
+        """`chunk_rounds`, or what is left; each family in turn in every round."""
+        config = self.config
+        count = min(config.chunk_rounds, config.rounds - at.update)
+        reports = []
+        # One family makes all its updates in one call; several take turns.
+        calls = 1 if len(config.families) == 1 else count
+        for call in range(calls):
+            rounds = np.arange(count // calls) + at.update + call
+            share = rounds / config.rounds
+            lr = (config.lr * (1.0 - 0.95 * share)).astype(np.float32)
+            entropy = (config.ent_coef * np.maximum(0.0, 1.0 - 1.2 * share)).astype(np.float32)
+            for i, family in enumerate(config.families):
+                keys = jnp.stack([jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
+                                                     int(r) * len(config.families) + i)
+                                  for r in rounds])
+                self.learner, self.walks[i], report = several(
+                    self.mesh, config.spec, family.draw, config.hyper, self.grounds[i],
+                    self.learner, self.walks[i], keys, lr, entropy)
+                reports.append(report)
+        return Made(count, count * config.decisions, _summary(gather(reports)))
+
+    @cached_property
+    def scenarios(self) -> list[HeldOut]:
+        """Of each family, with their optima."""
+        return [HeldOut(f, max(32, self.config.eval_scenarios // f.shrink))
+                for f in self.config.families]
+
+    def held_out(self, at: Position) -> dict[str, Any]:
+        """Success and gap of each family; before the first round too, and after the last."""
+        config = self.config
+        due = at.update // config.chunk_rounds % config.eval_every == 0
+        if not due and at.update < config.rounds:
+            return {}
+        return {"families": self.evaluate()}
+
+    def evaluate(self) -> list[dict[str, Any]]:
+        """Argmax on the held-out problems of each family."""
+        stored = self._stored("")
+        policy = Policy(PointerBrain(self.config.spec), jax.tree.map(jnp.asarray, stored.params),
+                        stored, self.name)
+        return [one.score(policy) for one in self.scenarios]
+
+    def _stored(self, commit: str) -> PolicyFile:
+        return PolicyFile("pointer", self.network, gather(self.learner.mean), self.recipe, commit)
+
+    def weights(self) -> Any:
+        """The parameters and their running mean."""
+        return self.learner.params, self.learner.mean
+
+    def state(self) -> Held:
+        """Learner and environments."""
+        return Held(self.learner, self.walks)
+
+    def shapes(self, phase: str) -> Held:
+        """They are always the same."""
+        return self.state()
+
+    def restore(self, phase: str, state: Held) -> None:
+        """Spreads it over the devices."""
+        self.learner = everywhere(self.mesh, Learner(*state.learner))
+        self.walks = [spread(self.mesh, Walk(*walk)) for walk in state.walks]
+
+    def score(self, row: Row) -> float | None:
+        """Mean success over the families, less the mean gap: both count."""
+        if "families" not in row:
+            return None
+        return _mean(row, "success") - _mean(row, "makespan_gap")
+
+    def fallen(self, rows: list[Row]) -> str:
+        """When success on the held-out problems has fallen to half of what it was."""
+        found = [_mean(row, "success") for row in rows if "families" in row]
+        if len(found) < 3 or max(found[-3:]) > max(found) / 2:
+            return ""
+        return f"it solves {found[-1]:.3f} of the held-out problems, and solved {max(found):.3f}"
+
+    def words(self, rows: list[Row]) -> str:
+        """Where it is, and how it did when last looked at."""
+        row, look = rows[-1], next(r for r in reversed(rows) if "families" in r)
+        return (f"round {row['update']:,} of {self.config.rounds:,}, {row['rate']:,.0f} decisions/s"
+                f", entropy {row['entropy']:.2f}, critic error {row['value_loss']:.3f}\n"
+                f"held out {_mean(look, 'success'):.3f} success, {_mean(look, 'makespan_gap'):.1%} "
+                "over the optimum")
+
+    def policy(self, at: Position, commit: str) -> PolicyFile:
+        """The running mean with network, recipe and commit in the header."""
+        return self._stored(commit)
+
+    def report(self, rows: list[Row]) -> dict[str, Any]:
+        """The last evaluation."""
+        return {"method": "MAPPO on macro-decisions",
+                "scenarios": self.config.eval_scenarios, "families": rows[-1]["families"]}
+
+    def lines(self, report: dict[str, Any]) -> list[str]:
+        """A line a family."""
+        return [*(f"{row['family']}: success {row['success']:.3f}, makespan "
+                  f"{row['makespan_gap']:.1%} over the optimum" for row in report["families"]),
+                f"{report['env_steps']:,} decisions in {report['seconds']:.0f} s"]
+
+    def draw_curve(self, path: Path, rows: list[Row]) -> None:
+        """Success and gap over minutes."""
+        draw_curve(path, {self.name: [rows]})
+
+
+def _mean(row: Row, key: str) -> float:
+    return float(np.mean([family[key] for family in row["families"]]))
+
+
+def _summary(reports: list[Report]) -> dict[str, float]:
+    """Means over a chunk's updates."""
+    whole = {name: np.concatenate([np.ravel(getattr(r, name)) for r in reports])
+             for name in Report._fields}
+    weight = np.maximum(whole["episodes"], 1)
+    row = {name: float(np.average(whole[name], weights=weight)) for name in ("success", "seconds")}
+    row = {"success": row["success"], "episode_seconds": row["seconds"]}
+    return row | {name: float(whole[name].mean()) for name in ("entropy", "value_loss", "clipped")}
