@@ -18,7 +18,8 @@ from moonteam.report import command
 from moonteam.report.command import Aside
 from training.commands import compare, imitate, refine, train
 
-TRAIN = {"train quick": imitate.Args, "train refine": refine.Args, "train compare": compare.Args}
+TRAIN = {"train imitate": imitate.Args, "train refine": refine.Args,
+         "train compare": compare.Args}
 KINDS = {name: importlib.import_module(module).Args
          for name, (module, _) in cli.COMMANDS.items() if name != "train"}
 
@@ -72,8 +73,7 @@ def test_every_option_is_written_so_that_it_is_read_back(name):
         all_odd[field.name] = odd[-1]
     asked.append(dataclasses.replace(asked[0], **all_odd))
     for args in asked:
-        known, found = parsed(command.line("train refine" if kind is refine.Args else
-                                           "train" if kind is imitate.Args else name, args))
+        known, found = parsed(command.line(name, args))
         assert name.startswith(known)
         assert type(found) is kind
         assert command.figures(found) == command.figures(args)
@@ -90,7 +90,8 @@ def test_every_option_is_written_so_that_it_is_read_back(name):
     "rollout outpost --planner exact --mode async",
     "site --centre -120 -35.5 --dem 'the moon.tif' --detrend --no-detail",
     "train compare runs/a runs/b --label GRU --label 'no memory'",
-    "train refine any_team --reward paper --beside runs/a --beside runs/b",
+    "train imitate quick --rounds 10 --begin any_team_imitated",
+    "train refine any_team_imitated --reward paper --beside runs/a --beside runs/b",
 ])
 def test_a_line_in_order_is_written_as_it_was(words):
     name, args = parsed(f"moonteam {words}")
@@ -98,6 +99,14 @@ def test_a_line_in_order_is_written_as_it_was(words):
     line = command.line(name, args)
     assert sorted(shlex.split(line)[1:]) == sorted(shlex.split(words))
     assert parsed(line)[1] == args
+
+
+@pytest.mark.parametrize("words", ["", "--rounds 30 --hyper.epochs 2 --spec.layers 2 --seed 5"])
+def test_a_preset_of_macro_decisions_is_written_by_what_differs_from_it(words):
+    _, args = parsed(f"moonteam train quick {words}")
+    line = command.line("train quick", args, train.parse(["quick"]))
+    assert parsed(line)[1] == args
+    assert line == f"moonteam train quick {words}".strip()
 
 
 @pytest.mark.parametrize("words", [

@@ -16,8 +16,8 @@ from training.run.compare import Kind, grouped, listed, notes, one_kind, plain, 
 
 @dataclass(frozen=True)
 class Args(Reported):
-    """Put run folders of `moonteam train` side by side: those of small, laptop and pi_*, or
-    those of quick, any_team and refine.
+    """Put run folders of `moonteam train` side by side: those of small, laptop and pi_*, those
+    of quick, paper_team and any_team, or those of imitate and refine.
 
     Runs that differ only in their seed are one row: the mean over seeds, in brackets the lowest
     and the highest. A row is named by what its numbers differ in from the first of its preset,
@@ -46,11 +46,12 @@ def run(args: Args) -> int:
     """Reads, prints, saves; returns the exit code."""
     from moonteam.report import command, provenance, tables
     from training.mappo.compared import MAPPO
+    from training.mappo.macro.compared import MACRO
     from training.teacher.compared import TAUGHT
 
     if not args.runs:
         raise InputError("RUN", "no run folder is given; at least one is needed")
-    found = [read(folder, (MAPPO, TAUGHT)) for folder in args.runs]
+    found = [read(folder, (MAPPO, MACRO, TAUGHT)) for folder in args.runs]
     kind, groups = one_kind(found), grouped(found, args.label)
     meta = provenance.meta(command.line("train compare", args), 0)
     document = {

@@ -1,4 +1,4 @@
-"""`moonteam train quick|any_team`: imitation of the exact planner."""
+"""`moonteam train imitate quick|any_team`: imitation of the exact planner."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Args(Taught):
     """Train the policy for any team by imitating the exact planner: quick or any_team.
 
     Examples:
-      moonteam train quick
-      moonteam train quick --seed 1 --out runs/quick-1
-      moonteam train any_team --out runs/any --resume
-      moonteam train any_team --begin any_team --lr 8e-4 --rounds 900 --out runs/further
+      moonteam train imitate quick
+      moonteam train imitate quick --seed 1 --out runs/pupil-1
+      moonteam train imitate any_team --out runs/pupil --resume
+      moonteam train imitate any_team --begin any_team_imitated --lr 8e-4 --rounds 900
     """
 
     preset: tyro.conf.Positional[Literal["quick", "any_team"]]
@@ -45,8 +45,8 @@ class Args(Taught):
 
 
 def parse(words: list[str]) -> Args:
-    """Arguments of `moonteam train quick|any_team`."""
-    return parse_words(Args, "train", words)
+    """Arguments of `moonteam train imitate`."""
+    return parse_words(Args, "train imitate", words)
 
 
 def run(args: Args) -> int:
@@ -60,7 +60,7 @@ def run(args: Args) -> int:
         raise InputError("--lr", f"{lr:g} is not allowed; above 0, at most 0.1")
     spec, params = entity_policy(args.begin) if args.begin else (preset.spec, None)
     config = dataclasses.replace(preset, seed=args.seed, rounds=rounds, lr=lr, spec=spec)
-    out = args.folder(args.preset, args.seed)
+    out = args.folder(f"imitate-{args.preset}", args.seed)
     use_all_cores()
     say("moonteam: making grounds and held-out scenarios, compiling")
     dagger = Dagger(config, params, args.preset, args.begin)

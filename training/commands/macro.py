@@ -1,4 +1,4 @@
-"""`moonteam train quick|paper|any_team`: MAPPO on macro-decisions, from scratch."""
+"""`moonteam train quick|paper_team|any_team`: MAPPO on macro-decisions, from scratch."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from training.sharding import use_all_cores
 @dataclass(frozen=True)
 class Args(Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
-    on two cores), paper (3 robots, 5 to 7 targets) or any_team (the shipped one).
+    on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one).
 
     A decision is a target, held until something happens. Every number of the preset can be
     changed by an option.
 
     Examples:
       moonteam train quick
-      moonteam train paper --seed 1 --out runs/paper-1
+      moonteam train paper_team --seed 1 --out runs/team-1
       moonteam train any_team --out runs/any --resume
       moonteam train any_team --policy any_team --lr 3e-4 --rounds 300 --out runs/further
     """

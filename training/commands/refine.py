@@ -26,9 +26,9 @@ class Args(Taught):
     """Refine an imitated policy by MAPPO, with a centralised critic over the same tokens.
 
     Examples:
-      moonteam train refine any_team --out runs/refined
-      moonteam train refine runs/quick-0/policy.safetensors --families quick --reward paper
-      moonteam train refine any_team --out runs/refined --resume --beside runs/control
+      moonteam train refine any_team_imitated --out runs/refined
+      moonteam train refine runs/imitate-quick-0/policy.safetensors --families quick --reward paper
+      moonteam train refine any_team_imitated --out runs/refined --resume --beside runs/control
     """
 
     policy: tyro.conf.Positional[str]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -17,10 +18,12 @@ from training.mappo import config as configs
 from training.mappo.config import Config
 
 if TYPE_CHECKING:
-    from training.commands import compare, imitate, refine
+    from training.commands import compare, imitate, macro, refine
 
-IMITATION = ("quick", "any_team")
-"""Presets that imitate the exact planner; see `training.commands.imitate`."""
+MACRO = ("quick", "paper_team", "any_team")
+"""Presets of MAPPO on macro-decisions; see `training.commands.macro`."""
+IMITATE = "imitate"
+"""Imitation of the exact planner; see `training.commands.imitate`."""
 REFINE = "refine"
 """MAPPO from an imitated policy; see `training.commands.refine`."""
 COMPARE = "compare"
@@ -29,16 +32,20 @@ COMPARE = "compare"
 
 @dataclass(frozen=True)
 class Args(Watched):
-    """Train a grid policy from a preset: pi_5t, pi_6t, pi_7t, pi_5t5r (the paper's),
-    small and laptop (for two cores).
+    """Train a grid policy from a preset.
 
-    The presets quick and any_team imitate the exact planner instead, for teams of any size, and
-    refine goes on from there by MAPPO; they have options of their own: moonteam train quick --help.
+    quick, paper_team, any_team: MAPPO from scratch, a target a decision, for teams of any size
+    (quick takes five minutes on two cores; any_team is what ships). The rest is what it is held
+    against: pi_5t, pi_6t, pi_7t, pi_5t5r, small and laptop, the paper's network a cell a decision;
+    imitate quick|any_team, the exact planner's pupil, and refine, which goes on from one by MAPPO.
+    They have options of their own: moonteam train quick --help, moonteam train imitate --help.
     compare puts runs side by side: moonteam train compare --help.
 
     The first word after `train` is the preset; every number of it can be changed by an option.
 
     Examples:
+      moonteam train quick
+      moonteam train any_team --out runs/any
       moonteam train small
       moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50
       moonteam train small --out runs/trial --seed 3 --bootstrap.updates 50 --resume
@@ -67,15 +74,19 @@ class Args(Watched):
     sets aside for them."""
 
 
-def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
+def parse(words: list[str]) -> Any:
     """Arguments of the command; the preset's numbers are the defaults of all options.
 
     Raises InputError for a preset that does not exist.
     """
-    if words and words[0] in IMITATION:
+    if words and words[0] in MACRO:
+        from training.commands import macro
+
+        return macro.parse(words)
+    if words and words[0] == IMITATE:
         from training.commands import imitate
 
-        return imitate.parse(words)
+        return imitate.parse(words[1:])
     if words and words[0] == REFINE:
         from training.commands import refine
 
@@ -87,23 +98,27 @@ def parse(words: list[str]) -> Args | imitate.Args | refine.Args | compare.Args:
     named = bool(words) and not words[0].startswith("-")
     asks_help = any(word in ("-h", "--help") for word in words)
     if not named and not asks_help:
-        configs.preset("" if not words else words[0])
+        preset("" if not words else words[0])
     name, rest = (words[0], words[1:]) if named else ("small", words)
-    default = Args(configs.preset(name))
+    default = Args(preset(name))
     return parse_words(Args, f"train {name if named else 'PRESET'}", rest, default)
 
 
-def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
+def preset(name: str) -> Config:
+    """The preset of that name, a cell a decision. Raises InputError listing all names."""
+    if name not in configs.PRESETS:
+        raise InputError(name, "no such preset; one of: " + ", ".join(
+            [*MACRO, *configs.PRESETS, f"{IMITATE} quick", f"{IMITATE} any_team", REFINE]))
+    return configs.PRESETS[name]
+
+
+def run(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> int:
     """Trains, describes or compares; returns the exit code."""
     from moonteam.compilation import enable_cache
 
     enable_cache()
     if not isinstance(args, Args):
-        from training.commands import compare, imitate, refine
-
-        if isinstance(args, compare.Args):
-            return compare.run(args)
-        return refine.run(args) if isinstance(args, refine.Args) else imitate.run(args)
+        return importlib.import_module(type(args).__module__).run(args)
     if args.dry_run:
         from training.bench import account
 
@@ -113,15 +128,18 @@ def run(args: Args | imitate.Args | refine.Args | compare.Args) -> int:
     return _train(args)
 
 
-def folder(args: Args | imitate.Args | refine.Args | compare.Args) -> Path:
+def folder(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> Path:
     """The run folder of a training. Raises InputError for a command that trains nothing."""
-    from training.commands import compare, refine
+    from training.commands import compare, macro, refine
 
     if isinstance(args, compare.Args) or (isinstance(args, Args) and args.dry_run):
         raise InputError("train", "trains nothing so, and has no run folder")
     if isinstance(args, Args):
         return args.folder(args.config.name, args.config.seed)
-    return args.folder(REFINE if isinstance(args, refine.Args) else args.preset, args.seed)
+    if isinstance(args, macro.Args):
+        return args.folder(args.config.macro, args.config.seed)
+    name = REFINE if isinstance(args, refine.Args) else f"{IMITATE}-{args.preset}"
+    return args.folder(name, args.seed)
 
 
 def _train(args: Args) -> int:

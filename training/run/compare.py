@@ -80,8 +80,8 @@ def read(folder: Path, kinds: tuple[Kind, ...]) -> Trained:
     config = files.read_json(folder / "config.json", dict[str, Any])
     kind = next((k for k in kinds if isinstance(config.get(k.name_key), str)), None)
     if kind is None or not isinstance(config.get("seed"), int):
-        raise InputError(folder, "is no run of the presets small, laptop or pi_*, nor one of "
-                         "quick, any_team or refine as they are written now")
+        raise InputError(folder, "is no run of the presets small, laptop, pi_*, quick, paper_team "
+                         "or any_team, nor one of imitate or refine as they are written now")
     path, ended = folder / "metrics.jsonl", folder / "report.json"
     rows = metrics.read(path)
     checked = files.convert(rows, list[kind.line], path)

@@ -116,7 +116,7 @@ def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pupil, "SCENARIOS", 8)
     monkeypatch.setitem(imitate.PRESETS, "quick", BOTH)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    words = ["train", "quick", "--checkpoint-seconds", "0", "--out"]
+    words = ["train", "imitate", "quick", "--checkpoint-seconds", "0", "--out"]
     assert main([*words, str(whole)]) == 0
     kill_when_saved(parts, [*words, str(parts)], SMALLER)
     assert main([*words, str(parts), "--resume", "--tensorboard"]) == 0
@@ -144,7 +144,7 @@ def test_an_interrupted_command_saves_and_returns_130(tmp_path, monkeypatch, cap
     monkeypatch.setattr(pupil, "SCENARIOS", 4)
     monkeypatch.setitem(imitate.PRESETS, "quick", TINY)
     monkeypatch.setattr(Run, "train", lambda self, stop: False)
-    assert main(["train", "quick", "--out", str(tmp_path)]) == 130
+    assert main(["train", "imitate", "quick", "--out", str(tmp_path)]) == 130
     line = capsys.readouterr().err
     assert f"interrupted after round 0, saved; go on with --out {tmp_path} --resume" in line
 

@@ -124,6 +124,6 @@ def test_impossible_numbers(tmp_path):
     with pytest.raises(InputError, match="minibatches"):
         Refinement(families=(SMALL,), num_envs=3, num_steps=5, minibatches=2)
     with pytest.raises(InputError, match="holds no run"):
-        refine.run(refine.Args("any_team", beside=(tmp_path,)))
+        refine.run(refine.Args("any_team_imitated", beside=(tmp_path,)))
     with pytest.raises(InputError, match="only entity policies"):
         refine.run(refine.Args("small", out=tmp_path / "new"))

@@ -89,7 +89,7 @@ SECONDS = Practice("3 unlike robots, 5 to 7 targets, straight",
 
 PRESETS = {
     "quick": MacroConfig("quick", (PAPER,), rounds=140),
-    "paper": MacroConfig("paper", (PAPER,), rounds=900),
+    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=900),
     "any_team": MacroConfig(
         "any_team", (
             PAPER,
@@ -113,6 +113,7 @@ PRESETS = {
                           limit=8000.0), shrink=16),
         ), rounds=900, hyper=Hyper(spread=True)),
 }
+
 
 
 def preset(name: str) -> MacroConfig:

@@ -1,0 +1,202 @@
+"""MAPPO on macro-decisions: one update, the run machine, the commands."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from moonteam.cli import main
+from moonteam.errors import InputError
+from moonteam.grid.macro import world
+from moonteam.grid.macro.draw import Draw, draw
+from moonteam.planners.seconds.exhaustive import ExhaustivePlanner
+from moonteam.policies.pointer import PointerSpec, look, point
+from moonteam.policies.policy import Policy
+from moonteam.policies.policy_file import load_policy
+from tests.training.killed import kill_when_saved
+from training.mappo.macro import grounds
+from training.mappo.macro.config import PRESETS, MacroConfig, Practice
+from training.mappo.macro.held_out import HeldOut, moment_of
+from training.mappo.macro.trainee import MacroMappo
+from training.mappo.macro.update import Batch, Hyper, Learner, chosen, collect, fresh, loss
+from training.run import checkpoints, metrics
+from training.run.machine import Run, Stop
+from training.run.trainee import Position
+
+SPEC = PointerSpec(width=16, heads=2, layers=1, pairs=8)
+SMALL = Draw(agents=(2, 2), targets=(2, 2), sides=(6, 6), limit=60.0)
+HYPER = Hyper(num_steps=4, minibatches=2)
+TINY = MacroConfig("quick", (Practice("small", SMALL),), rounds=3, num_envs=8, hyper=HYPER,
+                   spec=SPEC, chunk_rounds=1, eval_every=1, eval_scenarios=32)
+BOTH = dataclasses.replace(
+    TINY, families=(Practice("small", SMALL), Practice("closed", SMALL, grounds=8, shrink=2)),
+    rounds=6, hyper=dataclasses.replace(HYPER, spread=True))
+SMALLER = ("from training.mappo.macro import config; "
+           "from tests.training.mappo.macro.test_macro import BOTH; "
+           "config.PRESETS['quick'] = BOTH; ")
+
+
+def rows_of(seed=0, hyper=HYPER):
+    learner = MacroMappo(dataclasses.replace(TINY, seed=seed)).learner
+    walk = fresh(SMALL, hyper, None, jax.random.key(seed), 16)
+    return learner, walk, collect(SPEC, SMALL, hyper, None, learner.params, walk,
+                                  jax.random.key(seed + 1))
+
+
+def test_returns_are_what_an_episode_costs():
+    """With no discount the rewards of a whole episode are minus its price, in units."""
+    hyper = dataclasses.replace(HYPER, num_steps=12)
+    _, walk, (after, rows, _, lengths) = rows_of(hyper=hyper)
+    ended, reward = np.asarray(rows.ended), np.asarray(rows.reward)
+    assert ended.any(axis=0).all()
+    assert not np.asarray(rows.truncated).any()
+    for e in range(16):
+        first = int(np.argmax(ended[:, e]))
+        problem = jax.tree.map(lambda x, e=e: x[e], walk.states.problem)
+        state, spent, way = world.reset(problem), 0.0, 0.0
+        for t in range(first + 1):
+            result = world.step(state, rows.choice[t, e])
+            state, spent, way = result.state, spent + result.seconds, way + result.effort
+        assert bool(jnp.all(state.solved))
+        assert float(lengths[first, e]) == pytest.approx(float(spent))
+        price = ((1 + hyper.tie) * spent + hyper.tie * way) / problem.unit
+        assert float(reward[:first + 1, e].sum()) == pytest.approx(-float(price), rel=1e-5)
+
+
+def test_the_first_gradient_sees_ratios_of_one():
+    learner, _, (_, rows, _, _) = rows_of()
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+    said = point(learner.params, SPEC, flat.view)
+    log_prob, entropy = chosen(said.logits, flat.options, flat.choice)
+    np.testing.assert_allclose(log_prob, flat.log_prob, atol=1e-5)
+    single = np.asarray(flat.options.sum(-1)) == 1
+    assert single.any()
+    np.testing.assert_array_equal(np.asarray(log_prob)[single], 0.0)
+    np.testing.assert_array_equal(np.asarray(entropy)[single], 0.0)
+    assert (np.take_along_axis(np.asarray(flat.options), np.asarray(flat.choice)[..., None], -1)).all()
+
+
+def test_a_better_choice_becomes_likelier():
+    """One step against the loss moves an agent with a gain towards what it chose."""
+    learner, _, (_, rows, _, _) = rows_of()
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+    gain = jnp.ones(len(flat.value))
+    batch = Batch(flat.view, flat.choice, flat.options, flat.log_prob, gain, flat.value)
+    slope = jax.grad(lambda p: loss(p, SPEC, HYPER, batch, jnp.zeros(()))[0])(learner.params)
+    params = jax.tree.map(lambda p, g: p - 1e-2 * g, learner.params, slope)
+    after, _ = chosen(point(params, SPEC, flat.view).logits, flat.options, flat.choice)
+    real = np.asarray(flat.options.sum(-1)) > 1
+    assert np.asarray(after)[real].mean() > np.asarray(flat.log_prob)[real].mean()
+
+
+def test_training_learns():
+    """A minute's worth of a toy: the held-out gap falls to less than half of what it was."""
+    config = dataclasses.replace(TINY, rounds=40, num_envs=64, chunk_rounds=40, lr=3e-3,
+                                 hyper=dataclasses.replace(HYPER, num_steps=8, minibatches=4))
+    trainee = MacroMappo(config)
+    before = trainee.evaluate()[0]
+    trainee.chunk(Position("macro"))
+    after = trainee.evaluate()[0]
+    assert after["success"] == 1.0
+    assert after["makespan_gap"] < before["makespan_gap"] / 2
+
+
+def test_held_out_optima_are_optima():
+    held = HeldOut(Practice("small", SMALL), 12)
+    for i in range(12):
+        problem = jax.tree.map(lambda x, i=i: x[i], held.problems)
+        plan = ExhaustivePlanner().plan(moment_of(problem))
+        assert plan.makespan == round(held.best[i] * 1000)
+
+
+def test_closed_ground_is_a_detour():
+    """Ways over blocked maps are no shorter than on open ones, and some are longer."""
+    made = jax.device_get(grounds.make(Draw(targets=(3, 3), sides=(12, 12)), 6, 0))
+    finite = made.start < 1e8
+    assert finite.any()
+    there = made.between[:, 0]  # the first kind crosses everything
+    assert (made.between[:, 1:] >= there[:, None] - 1e-6).all()
+    assert (made.between[:, 1:] > there[:, None] + 1e-6).any()
+
+
+@pytest.mark.parametrize("family", [f for one in PRESETS.values() for f in one.families],
+                         ids=lambda f: f.name)
+def test_every_family_draws_problems_that_can_be_solved(family):
+    """By random choices, whatever it asks for."""
+    count, turns = 4, 3 * (family.draw.agents[1] + 2 * family.draw.targets[1])
+    small = dataclasses.replace(family.draw, agents=(2, min(4, family.draw.agents[1])),
+                                targets=(1, min(6, family.draw.targets[1])))
+    ground = grounds.make(small, 4, 1) if family.grounds else None
+    walk = fresh(small, Hyper(spread=True), ground, jax.random.key(5), count)
+
+    @jax.jit
+    def step(state, key):
+        shape = (small.agents[1], small.targets[1] + 1)
+        choice, _ = jax.vmap(world.choose)(state, jax.random.normal(key, (count, *shape)),
+                                           jnp.zeros((count, *shape)))
+        return jax.vmap(world.step)(state, choice).state
+
+    state = walk.states
+    for t in range(turns):
+        state = step(state, jax.random.key(t))
+    assert np.asarray(state.solved).all() or ground is not None
+    view = jax.vmap(look)(walk.states, walk.preference)
+    assert all(np.isfinite(np.asarray(x, np.float32)).all() for x in jax.tree.leaves(view))
+
+
+def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, "quick", BOTH)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    words = ["train", "quick", "--checkpoint-seconds", "0", "--out"]
+    assert main([*words, str(whole)]) == 0
+    kill_when_saved(parts, [*words, str(parts)], SMALLER)
+    assert main([*words, str(parts), "--resume"]) == 0
+    before, after = (load_policy(out / "policy.safetensors").params for out in (whole, parts))
+    for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        np.testing.assert_array_equal(a, b)
+    ends = [checkpoints.load(out / "checkpoints")[1] for out in (whole, parts)]
+    for name, array in ends[0].items():
+        np.testing.assert_array_equal(array, ends[1][name], err_msg=name)
+    rows = [[{k: v for k, v in row.items() if k not in ("seconds", "rate")}
+             for row in metrics.read(out / "metrics.jsonl")] for out in (whole, parts)]
+    assert rows[0] == rows[1]
+    capsys.readouterr()
+    assert main(["train", "compare", str(whole), "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["summary"]
+    shown = rows[0][-1]["families"]
+    assert row["makespan_gap"] == pytest.approx(np.mean([f["makespan_gap"] for f in shown]))
+    assert Policy.load(whole / "policy.safetensors").source.kind == "pointer"
+
+
+def test_impossible_numbers(tmp_path, capsys):
+    with pytest.raises(InputError, match="do not divide"):
+        dataclasses.replace(TINY, num_envs=7, hyper=dataclasses.replace(HYPER, minibatches=8))
+    with pytest.raises(InputError, match="at least 1"):
+        dataclasses.replace(TINY, rounds=0)
+    assert main(["train", "quick", "--policy", "small", "--out", str(tmp_path / "x")]) == 2
+    assert "only pointer policies" in capsys.readouterr().err
+
+
+def test_not_a_number_stops_the_run(tmp_path):
+    run = Run(MacroMappo(TINY), tmp_path, False)
+    run.train(Stop(), stop_after=1)
+    learner = run.trainee.learner
+    run.trainee.learner = Learner(jax.tree.map(lambda x: x * np.nan, learner.params),
+                                  *learner[1:])
+    with pytest.raises(Exception, match="not a number"):
+        run.train(Stop())
+
+
+def test_problems_are_drawn_as_the_grid_draws_them():
+    """The macro world's problem is the grid's, by the clock: the same tables."""
+    family = Draw()
+    problem = jax.device_get(draw(family, jax.random.key(3)))
+    assert problem.start.shape == (3, 7)
+    assert problem.has.shape == (3, 2)
+    real = problem.target_mask
+    assert (problem.start[:, real] > 0).all()
+    assert (problem.start[:, real] % 1 == 0).all()
+    np.testing.assert_array_equal(problem.between[0], problem.between[0].T)
