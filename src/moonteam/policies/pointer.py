@@ -107,12 +107,12 @@ def look(state: MacroState, preference: Array) -> Outlook:
     best = jnp.min(jnp.where(p.agent_mask[:, None, None], p.between, FAR), axis=0)
     known = open_[:, None] & open_[None] & (best > 0) & (best < FAR)
     ways = jnp.where(known[None] & (p.between < FAR), p.between, 0.0)
-    ratio = jnp.sum(ways, axis=(1, 2)) / jnp.maximum(jnp.sum(jnp.where(ways > 0, best, 0.0),
+    ratio = jnp.sum(ways, axis=(1, 2)) / jnp.maximum(jnp.sum(jnp.where(ways > 0, best[None], 0.0),
                                                              axis=(1, 2)), 1e-6)
-    first = jnp.where(open_ & (p.start < FAR), p.start, FAR)
+    first = jnp.where(open_[None] & (p.start < FAR), p.start, FAR)
     plain = jnp.min(first, axis=0)
     alone = jnp.sum(jnp.where(first < FAR, p.start, 0.0), 1) / jnp.maximum(
-        jnp.sum(jnp.where(first < FAR, plain, 0.0), 1), 1e-6)
+        jnp.sum(jnp.where(first < FAR, plain[None], 0.0), 1), 1e-6)
     slow = jnp.log(jnp.clip(jnp.where(ratio > 0, ratio, alone), 0.05, 20.0))
     waits = p.after & ~state.solved[None]
     busy = state.serving | (shown & ~incomplete)  # under way

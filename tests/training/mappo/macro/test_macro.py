@@ -49,7 +49,7 @@ def rows_of(seed=0, hyper=HYPER):
 def test_returns_are_what_an_episode_costs():
     """With no discount the rewards of a whole episode are minus its price, in units."""
     hyper = dataclasses.replace(HYPER, num_steps=12)
-    _, walk, (after, rows, _, lengths) = rows_of(hyper=hyper)
+    _, walk, (_, rows, _, lengths) = rows_of(hyper=hyper)
     ended, reward = np.asarray(rows.ended), np.asarray(rows.reward)
     assert ended.any(axis=0).all()
     assert not np.asarray(rows.truncated).any()
@@ -76,7 +76,7 @@ def test_the_first_gradient_sees_ratios_of_one():
     assert single.any()
     np.testing.assert_array_equal(np.asarray(log_prob)[single], 0.0)
     np.testing.assert_array_equal(np.asarray(entropy)[single], 0.0)
-    assert (np.take_along_axis(np.asarray(flat.options), np.asarray(flat.choice)[..., None], -1)).all()
+    assert np.take_along_axis(np.asarray(flat.options), np.asarray(flat.choice)[..., None], -1).all()
 
 
 def test_a_better_choice_becomes_likelier():
