@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from moonteam.grid import scenarios
-from moonteam.planners import registry, simulate
+from moonteam.planners import contract, registry, simulate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.pointing import Batch, PointingPlanner
@@ -108,3 +108,8 @@ def test_a_batch_plans_as_one_by_one(make):
         trace = simulate.replay(now, planner.plan(now).actions)
         assert simulate.replay(now, actions).actions.tolist() == trace.actions.tolist()
     assert plans[3].shape == (0, 3)
+
+
+def test_it_keeps_every_promise_of_a_planner(pointing):
+    results = contract.check("policy", PlannerOptions(policy=pointing))
+    assert [result for result in results if not result.passed] == []
