@@ -174,12 +174,19 @@ class EntityBrain:
         return ""
 
 
+_LOOSE = 0.25
+"""Share of what a pointing agent weighs that its settled choice does not take; below a third, so
+that one of two moves that bring it nearer outweighs staying."""
+
+
 @dataclass(frozen=True)
 class PointerBrain:
     """The network that points at targets, asked anew at every step; it has no memory.
 
-    At each moment all agents are free and choose among the targets; each chosen target's weight
-    is spread over the moves that shorten the way to it. Whole plans, in which a choice is held
+    At each moment all agents are free and choose among the targets, claims settled as in
+    `grid.macro.world.choose`; each target's weight is spread over the moves that shorten the way
+    to it. The likeliest action is always one of the settled choice: of moves that serve it
+    equally, the one that suits the other targets best. Whole plans, in which a choice is held
     until the target is solved, are made by `planners.macro` from the same network.
     """
 
@@ -205,14 +212,32 @@ class PointerBrain:
 
         moments = jax.vmap(moment)(states, horizon, fields)
         said = pointer.point(params, self.spec, jax.vmap(pointer.look)(moments, preference))
-        _, options = jax.vmap(world.choose)(moments, said.logits, jnp.zeros_like(said.logits))
-        weight = jax.nn.softmax(jnp.where(options, said.logits, -FAR), axis=-1)
+        weight = jax.vmap(_settled)(moments, said.logits)
         return memory, jax.vmap(_moves)(states, fields, weight)
 
     def misfit(self, mission: Mission) -> str:
         """See `Brain`: everything fits."""
         del mission
         return ""
+
+
+def _settled(state: MacroState, logits: Array) -> Array:
+    """[N, M + 1] what each agent weighs of the targets and of waiting, when claims are settled.
+
+    Who waits at a target already must not count as somebody under way, for whose coming the others
+    may wait: where nobody would move, nobody may wait who has a choice.
+    """
+    targets = logits.shape[1] - 1
+    none = jnp.zeros_like(logits)
+    eager = logits.at[:, targets].set(-FAR / 2)
+    patient, may = world.choose(state, logits, none)
+    hurried, must = world.choose(state, eager, none)
+    here = state.problem.start <= 0  # [N, M]
+    goes = jax.nn.one_hot(patient, targets, dtype=bool) & ~here
+    still = ~jnp.any(goes)
+    choice, options = jnp.where(still, hurried, patient), jnp.where(still, must, may)
+    weight = jax.nn.softmax(jnp.where(options, jnp.where(still, eager, logits), -FAR), axis=-1)
+    return _LOOSE * weight + (1.0 - _LOOSE) * jax.nn.one_hot(choice, targets + 1)
 
 
 def _by_target(state: State, limit: Array, fields: Array | None) -> MacroProblem:
