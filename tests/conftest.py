@@ -16,6 +16,21 @@ enable_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
+@pytest.fixture(scope="session")
+def pointing(tmp_path_factory):
+    """A policy file of kind pointer with random weights: it solves everything, in a poor order."""
+    from dataclasses import asdict
+
+    from moonteam.policies import pointer
+    from moonteam.policies.policy_file import PolicyFile, save_policy
+
+    spec = pointer.PointerSpec(width=8, heads=2, layers=1, pairs=4)
+    params = jax.device_get(jax.jit(lambda key: pointer.init(spec, key))(jax.random.key(2)))
+    path = tmp_path_factory.mktemp("policy") / "pointing.safetensors"
+    save_policy(path, PolicyFile("pointer", asdict(spec), params))
+    return path
+
+
 def pytest_collection_modifyitems(config, items):
     """What takes minutes is left out unless it is asked for: `make soak`."""
     if "soak" in config.getoption("markexpr"):

@@ -15,6 +15,7 @@ from moonteam.grid.travel import first_step
 from moonteam.grid.types import State
 from moonteam.planners.base import Planner
 from moonteam.planners.learned import LearnedPlanner
+from moonteam.planners.pointing import PointingPlanner
 from moonteam.policies.brain import Brain
 
 
@@ -85,11 +86,13 @@ class FirstOpen:
 
 def decider_of(planner: Planner) -> tuple[Decider, Any]:
     """A planner as a decider with its parameters. Raises InputError for one that cannot be."""
-    if not isinstance(planner, LearnedPlanner):
+    if not isinstance(planner, LearnedPlanner | PointingPlanner):
         raise InputError("--backend fused", f"the planner {planner.name} cannot be part of a "
                          "program for MJX; allowed: --planner policy with --decode argmax or "
                          "plain-argmax")
-    if planner.decode != "argmax":
+    drawn = planner.decode != "argmax" if isinstance(planner, LearnedPlanner) else (
+        planner.decode.sample)
+    if drawn:
         raise InputError("--backend fused", "a policy inside the program takes its likeliest "
                          "actions; allowed: --decode argmax or plain-argmax")
     return PolicyDecider(planner.policy.brain, planner.preference), planner.policy.params

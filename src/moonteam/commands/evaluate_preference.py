@@ -44,15 +44,15 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import figures, preference
     from moonteam.planners import decode
-    from moonteam.policies.brain import EntityBrain
     from moonteam.policies.policy import Policy
     from moonteam.report import command, tables
 
     how = decode.parse(args.decode)
     found = load_set(args.set, args.limit)
     policy = Policy.load(paths.find(args.policy, "policies", ".safetensors"))
-    if not isinstance(policy.brain, EntityBrain):
-        raise InputError(policy.path, "takes no preference: its network is not of kind entity")
+    if not policy.brain.prefers:
+        raise InputError(policy.path, "takes no preference: its network is of kind "
+                         f"{policy.source.kind}")
     wishes = [round(i / (args.points - 1), 6) for i in range(args.points)]
     title = f"{Path(args.set).stem}: {len(found)} scenarios, preference from time to effort"
     document = preference.evaluate(found, policy, how, wishes, args.seed, title,

@@ -72,8 +72,9 @@ def run(args: Args) -> int:
         print(f"moonteam: interrupted; the report lacks {lacking}", file=sys.stderr)
     document = {
         "title": "policies and planners on sets", "summary": rows, "rows": [], "rows_are": "set",
-        "notes": [f"argmax: with the deadlock watch; best-of-{args.best_of}: planning time is the "
-                  "whole set's, played in batches, over its scenarios.",
+        "notes": ["argmax: with the deadlock watch, of networks that decide step by step; best-of-"
+                  f"{args.best_of}: planning time is the whole set's, played in batches, over its "
+                  "scenarios.",
                   "5x20 and 8x40 are held against the best known plans, the others against "
                   "certified optima. In brackets: 95 % bootstrap intervals."],
         "meta": provenance.meta(command.line("evaluate sets", args), args.seed)}

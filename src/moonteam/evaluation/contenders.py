@@ -13,14 +13,22 @@ import numpy as np
 
 from moonteam import paths
 from moonteam.errors import InputError
-from moonteam.evaluation import rollouts
 from moonteam.evaluation.metrics import Outcomes
-from moonteam.evaluation.world import Walk, World, joint_actions, replay, snapshots
-from moonteam.planners import best_of, registry, simulate
+from moonteam.evaluation.played import play
+from moonteam.evaluation.world import Walk, World, play_plans, snapshots
 from moonteam.planners import decode as decoding
-from moonteam.planners.base import IntArray, Objective, Snapshot, WholePlanner, check_objective
+from moonteam.planners import registry, simulate
+from moonteam.planners.base import (
+    BoolArray,
+    IntArray,
+    Objective,
+    Snapshot,
+    WholePlanner,
+    check_objective,
+)
 from moonteam.planners.decode import Decode
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerKind, PlannerOptions
+from moonteam.policies.brain import PointerBrain
 from moonteam.policies.policy import Policy
 from moonteam.report.progress import track
 
@@ -94,23 +102,21 @@ class Planned:
 
     def run(self, world: World) -> Outcomes:
         """See `Contender`; plans round by round, a round ends where a target appears."""
-        walk, spent, first_call = world.start, 0.0, 0.0
-        for round_ in range(world.num_buffer + 1):
+        spent, first_call = 0.0, 0.0
+
+        def plan(moments: list[Snapshot], over: BoolArray, round_: int) -> list[IntArray]:
+            nonlocal spent, first_call
             title = f"{self.name} {round_ + 1}" if world.num_buffer else self.name
-            plans, seconds = self._plan_all(world, walk, title, warm=round_ == 0)
+            plans, seconds = self._plan_all(moments, over, title, warm=round_ == 0)
             spent, first_call = spent + sum(seconds[1:]), first_call + seconds[0]
-            walk = replay(world.config, walk, world.horizon, joint_actions(world, plans),
-                          pause=world.num_buffer > 0)
-            if not np.asarray(walk.waiting).any():
-                break
-            walk = Walk(walk.state, walk.moves, walk.waiting & False)
+            return plans
+
+        walk = play_plans(world, plan)
         return outcomes(self.name, world, walk, spent, first_call)
 
-    def _plan_all(self, world: World, walk: Walk, title: str,
+    def _plan_all(self, moments: list[Snapshot], over: BoolArray, title: str,
                   warm: bool) -> tuple[list[IntArray], list[float]]:
         """Plans for every episode that goes on; seconds of each, the first call's in front."""
-        over = np.asarray(walk.done | (walk.state.step >= world.horizon))
-        moments = snapshots(world, walk)
         seconds = [0.0]
         if warm and not over.all():  # what is loaded or compiled at the first call
             began = time.perf_counter()
@@ -159,20 +165,19 @@ class Learned:
     def run(self, world: World) -> Outcomes:
         """See `Contender`."""
         options = self.options
-        prices = best_of.prices(self.objective, options.alpha, options.beta, self.preference)
-        tries = rollouts.run(self.policy, world, self.decode, self.preference, options.seed,
-                             self.name, prices, options.alone)
-        choice = rollouts.best(tries, prices)
-        success, steps, moves, rescues = (rollouts.picked(v, choice) for v in (
-            tries.success, tries.steps, tries.moves, tries.rescues))
+        played = play(self.policy, world, self.decode,
+                      options.of(self.objective, preference=self.preference), self.name,
+                      options.alone)
+        steps, rescues = played.steps, played.rescues
         note = ("planning time with one scenario at a time" if options.alone else
                 "planning time is the whole set's, played in batches, over its scenarios; "
                 "--alone plays one at a time")
-        if self.decode.watch:
+        if self.decode.watch and not isinstance(self.policy.brain, PointerBrain):
             note = (f"the deadlock watch drew {rescues.sum()} of {steps.sum()} decisions, in "
                     f"{(rescues > 0).sum()} of {len(world)} scenarios; plain-argmax goes without; "
                     + note)
-        return Outcomes(self.name, success, steps, moves, tries.seconds, tries.compiling, note)
+        return Outcomes(self.name, played.success, steps, played.moves, played.seconds,
+                        played.compiling, note)
 
 
 def outcomes(name: str, world: World, walk: Walk, seconds: float, first_call: float) -> Outcomes:

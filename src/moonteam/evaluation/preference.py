@@ -11,14 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from moonteam.evaluation import metrics, rollouts
+from moonteam.evaluation import metrics
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Planned
 from moonteam.evaluation.metrics import Outcomes, Reference
+from moonteam.evaluation.played import play
 from moonteam.evaluation.world import World
-from moonteam.planners import best_of
 from moonteam.planners.decode import Decode
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
+from moonteam.planners.kind import PlannerOptions
 from moonteam.policies.policy import Policy
 from moonteam.problem.scenario import Scenario
 from moonteam.report import provenance
@@ -59,13 +60,10 @@ def evaluate(scenarios: Sequence[Scenario], policy: Policy, decode: Decode,
 
 def _policy(world: World, policy: Policy, decode: Decode, preference: float,
             seed: int) -> Outcomes:
-    prices = best_of.prices(preference=preference)
-    tries = rollouts.run(policy, world, decode, preference, seed, f"preference {preference:g}",
-                         prices)
-    choice = rollouts.best(tries, prices)
-    success, steps, moves = (rollouts.picked(v, choice) for v in (
-        tries.success, tries.steps, tries.moves))
-    return Outcomes(POLICY, success, steps, moves, tries.seconds, tries.compiling)
+    found = play(policy, world, decode, PlannerOptions(preference=preference, seed=seed),
+                 f"preference {preference:g}")
+    return Outcomes(POLICY, found.success, found.steps, found.moves, found.seconds,
+                    found.compiling)
 
 
 def _exact(world: World, preference: float) -> Outcomes:

@@ -7,7 +7,7 @@ them), N agents, M targets, T steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,7 +23,7 @@ from moonteam.evaluation.metrics import Family
 from moonteam.grid import env, scenarios
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.types import Problem, State
-from moonteam.planners.base import Snapshot
+from moonteam.planners.base import BoolArray, Snapshot
 from moonteam.problem.scenario import Scenario
 
 
@@ -149,6 +149,25 @@ def joint_actions(world: World, plans: Sequence[npt.ArrayLike]) -> Array:
         if len(part):
             out[:len(part), i, :part.shape[1]] = part
     return jnp.asarray(out)
+
+
+def play_plans(world: World, plan: Callable[[list[Snapshot], BoolArray, int],
+                                             Sequence[npt.ArrayLike]]) -> Walk:
+    """Every episode to its end, planned anew wherever a target appears.
+
+    `plan(moments, over, round)` returns the joint actions [T, N] of each moment; what it says of
+    episodes that are over [S] bool is not played.
+    """
+    walk = world.start
+    for round_ in range(world.num_buffer + 1):
+        over = np.asarray(walk.done | (walk.state.step >= world.horizon))
+        plans = plan(snapshots(world, walk), over, round_)
+        walk = replay(world.config, walk, world.horizon, joint_actions(world, plans),
+                      pause=world.num_buffer > 0)
+        if not np.asarray(walk.waiting).any():
+            break
+        walk = Walk(walk.state, walk.moves, walk.waiting & False)
+    return walk
 
 
 def snapshots(world: World, walk: Walk) -> list[Snapshot]:

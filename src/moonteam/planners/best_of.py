@@ -34,7 +34,7 @@ from moonteam.grid.config import EnvConfig
 from moonteam.grid.types import State
 from moonteam.planners import simulate
 from moonteam.planners.base import SAMPLING, IntArray, Objective, Plan, Snapshot, check_objective
-from moonteam.planners.kind import PlannerKind, PlannerOptions
+from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.learned import LearnedPlanner, fields_of, masked, state_of
 from moonteam.planners.plans.follow import Follower
 from moonteam.planners.plans.routes import Certificate, infeasible, plan_of_trace
@@ -249,18 +249,3 @@ def _roll(brain: Brain, params: Any, state: State, fields: Array | None, seed: A
     start = _Rollouts(jnp.zeros((), jnp.int32), many(state), brain.begin(count, agents), none,
                       none, jnp.zeros((room, count, agents), jnp.int8))
     return jax.lax.while_loop(going, step, start)
-
-
-def _planner(options: PlannerOptions) -> LearnedPlanner | BestOfPlanner:
-    how, policy = options.decoding, options.loaded()
-    if how.rollouts > 1:
-        return BestOfPlanner(policy, how.rollouts, options.objective, how.temperature,
-                             alpha=options.alpha, beta=options.beta,
-                             preference=options.preference, seed=options.seed)
-    return LearnedPlanner(policy, "sample" if how.sample else "argmax", how.temperature,
-                          how.sample or how.watch, options.preference, options.seed,
-                          options.goal[0])
-
-
-PLANNER = PlannerKind("policy", _planner, wants_policy=True)
-"""A learned policy, however it is decoded."""

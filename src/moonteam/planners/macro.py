@@ -137,28 +137,53 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
     Raises:
       InputError: the policy is of another kind, or that is no number of tries.
     """
-    spec = spec_of(policy)
     if not 1 <= tries <= MOST_ROLLOUTS:
         raise InputError("rollouts", f"{tries} is not allowed; 1 to {MOST_ROLLOUTS}")
+    play = _Call.of(policy, problems, tries)
     count = len(problems.limit)
-    agents, targets = problems.start.shape[1:]
-    rows = 1 << (min(count, max(1, _CHUNK // tries)) - 1).bit_length()
-    places = max(1, min(_PLACES, _PAIRS // (agents + targets) ** 2, rows * tries))
     parts = []
-    for first in range(0, count, rows):
-        index = np.arange(first, first + rows)
-        part = jax.tree.map(lambda x, i=index: x[np.minimum(i, count - 1)], problems)
-        real = min(rows, count - first)
-        done = _play(spec, policy.params, part, np.int32(real * tries), np.int32(first),
-                     np.float32(heat), np.uint32(seed % 2**32), np.float32(preference), tries,
-                     places)
-        done = jax.device_get(done)
-        parts.append(jax.tree.map(lambda x, n=real: x.reshape(rows, tries, *x.shape[1:])[:n],
-                                  done))
+    for first in range(0, count, play.rows):
+        real = min(play.rows, count - first)
+        done = play(problems, first, real, heat, seed, preference)
+        parts.append(jax.tree.map(
+            lambda x, n=real: x.reshape(play.rows, tries, *x.shape[1:])[:n], done))
         tick(real * tries)
     whole: _Done = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     start, end = _times(problems, whole)
     return Rollouts(whole.solved, whole.seconds, whole.effort, whole.order, start, end)
+
+
+def warm(policy: Policy, problems: MacroProblem, tries: int = 1) -> None:
+    """Compiles what `rollouts` of problems of these shapes needs, and plays nothing."""
+    _Call.of(policy, problems, tries)(problems, 0, 0, 0.0, 0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Call:
+    """The compiled program for one shape."""
+
+    spec: PointerSpec
+    params: Any
+    tries: int
+    rows: int  # problems of a call
+    places: int  # E
+
+    @classmethod
+    def of(cls, policy: Policy, problems: MacroProblem, tries: int) -> _Call:
+        """Sizes by the memory that the pool takes."""
+        spec, (count, agents, targets) = spec_of(policy), problems.start.shape
+        rows = 1 << (min(count, max(1, _CHUNK // tries)) - 1).bit_length()
+        places = max(1, min(_PLACES, _PAIRS // (agents + targets) ** 2, rows * tries))
+        return cls(spec, policy.params, tries, rows, places)
+
+    def __call__(self, problems: MacroProblem, first: int, real: int, heat: float, seed: int,
+                 preference: float) -> _Done:
+        """Plays `real` problems from number `first` on; NumPy arrays."""
+        index = np.minimum(np.arange(first, first + self.rows), len(problems.limit) - 1)
+        done = _play(self.spec, self.params, jax.tree.map(lambda x: x[index], problems),
+                     np.int32(real * self.tries), np.int32(first), np.float32(heat),
+                     np.uint32(seed % 2**32), np.float32(preference), self.tries, self.places)
+        return jax.device_get(done)
 
 
 class _Done(NamedTuple):

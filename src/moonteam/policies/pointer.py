@@ -109,7 +109,7 @@ def look(state: MacroState, preference: Array) -> Outlook:
     ways = jnp.where(known[None] & (p.between < FAR), p.between, 0.0)
     ratio = jnp.sum(ways, axis=(1, 2)) / jnp.maximum(jnp.sum(jnp.where(ways > 0, best, 0.0),
                                                              axis=(1, 2)), 1e-6)
-    first = jnp.where(open_ & (p.start < FAR), p.start, FAR)
+    first = jnp.where(open_[None] & (p.start < FAR), p.start, FAR)
     plain = jnp.min(first, axis=0)
     alone = jnp.sum(jnp.where(first < FAR, p.start, 0.0), 1) / jnp.maximum(
         jnp.sum(jnp.where(first < FAR, plain, 0.0), 1), 1e-6)

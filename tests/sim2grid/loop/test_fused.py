@@ -10,8 +10,10 @@ import pytest
 from moonteam import paths
 from moonteam.errors import InputError
 from moonteam.physics.backends import MjxBackend
+from moonteam.planners import registry
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
+from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.learned import LearnedPlanner, state_of
 from moonteam.policies import entity
 from moonteam.policies.brain import EntityBrain
@@ -184,4 +186,19 @@ def test_a_network_decides_for_missions_side_by_side(crew):
                                        jnp.full(2, 12))
     assert joint.shape == (2, 3)
     assert ((joint >= 0) & (joint < 5)).all()
+    assert joint[0].tolist() == joint[1].tolist()
+
+
+def test_a_pointing_policy_decides_inside_the_program(crew, pointing):
+    made = [registry.make("policy", PlannerOptions(policy=pointing, decode=how))
+            for how in ("argmax", "sample")]
+    with pytest.raises(InputError, match="allowed: --decode argmax"):
+        decider_of(made[1])
+    decider, params = decider_of(made[0])
+    start = state_of(Snapshot.start(crew.scenarios[0]))
+    states = jax.tree.map(lambda a: np.stack([a, a]), start)
+    _, joint = jax.jit(decider.decide)(params, decider.begin(2, 3), states, None,
+                                       jnp.full(2, 12))
+    assert joint.shape == (2, 3)
+    assert (joint[0] < 4).any()
     assert joint[0].tolist() == joint[1].tolist()

@@ -20,10 +20,12 @@ from moonteam.grid.scenarios import generate
 from moonteam.planners import registry
 from moonteam.planners.base import OBJECTIVES, Snapshot, check_objective
 from moonteam.planners.best_of import plan_best_of
+from moonteam.planners.decode import parse
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.learned import LearnedPlanner
+from moonteam.planners.pointing import PointingPlanner
 from moonteam.policies import policy_file, recurrent
-from moonteam.policies.brain import EntityBrain, RecurrentBrain
+from moonteam.policies.brain import PointerBrain, RecurrentBrain
 from moonteam.policies.policy import Policy
 from moonteam.policies.recurrent import RecurrentSpec
 from moonteam.report import clock, provenance
@@ -84,7 +86,7 @@ def untrained(spec: RecurrentSpec) -> Policy:
 
 def policy_for(given: Policy | None, sizes: Sizes, targets: int) -> Policy:
     """The given policy if it takes any size, else its network made for this size."""
-    if given is not None and isinstance(given.brain, EntityBrain):
+    if given is not None and not isinstance(given.brain, RecurrentBrain):
         return given
     wanted = RecurrentSpec(sizes.num_agents, targets, (sizes.side, sizes.side))
     if given is not None and isinstance(given.brain, RecurrentBrain):
@@ -121,8 +123,13 @@ def _policy_methods(policy: Policy, best_of: int) -> dict[str, Callable[[Snapsho
         planner.reset(moment)
         return planner.act(moment)
 
-    return {DECISION: decide, PLAN: lambda moment: plan_best_of(policy, moment, 1),
-            f"{BEST} {best_of} plans": lambda moment: plan_best_of(policy, moment, best_of)}
+    def best(count: int) -> Callable[[Snapshot], Any]:
+        if not isinstance(policy.brain, PointerBrain):
+            return lambda moment: plan_best_of(policy, moment, count)
+        decode = f"best-of-{count}" if count > 1 else "argmax"
+        return PointingPlanner(policy, parse(decode), PlannerOptions()).plan
+
+    return {DECISION: decide, PLAN: best(1), f"{BEST} {best_of} plans": best(best_of)}
 
 
 def evaluate(given: Policy | None, sizes: Sizes, command: str, cores: str = "") -> dict:

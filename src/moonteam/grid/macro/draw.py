@@ -21,7 +21,7 @@ from moonteam.problem.timed import Metric
 
 def bits(mask: Array, skills: int = MAX_SKILLS) -> Array:
     """[...] bit mask -> [..., S] bool."""
-    shifts = jnp.arange(skills, dtype=mask.dtype).reshape(*[1] * mask.ndim, skills)
+    shifts = jnp.arange(skills, dtype=mask.dtype).reshape((1,) * mask.ndim + (skills,))
     return ((mask[..., None] >> shifts) & 1) == 1
 
 

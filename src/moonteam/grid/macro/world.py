@@ -90,7 +90,7 @@ def allowed(state: MacroState, goal: Array) -> Array:
     sure = state.solved | state.serving | (complete & problem.target_mask)
     before = jnp.all(~problem.after | sure[None], axis=1)  # [M]
     arrives = state.now + legs(problem, state.node)
-    in_time = arrives <= jnp.minimum(problem.lapses, FAR / 2)[None] + SOON
+    in_time = arrives <= (jnp.minimum(problem.lapses, FAR / 2) + SOON)[None]
     return (open_targets(state) & before)[None] & helps & whole & in_time & free(state)[:, None]
 
 

@@ -27,12 +27,12 @@ class Answer:
     """What a search says of a task.
 
     `routes` [N, *] are indices of open targets padded by -1, None if there is no plan within
-    the horizon; `bound` is a lower bound of the objective; `proved` that none is better (or
-    that there is none).
+    the horizon; `bound` is a lower bound of the objective, if one is known; `proved` that none is
+    better (or that there is none).
     """
 
     routes: IntArray | None
-    bound: float
+    bound: float | None
     proved: bool
 
 

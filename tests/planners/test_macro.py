@@ -1,0 +1,142 @@
+"""Rollouts in the macro world: against one played by hand, padded, drawn, with services."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from moonteam.errors import InputError
+from moonteam.grid import scenarios
+from moonteam.grid.macro import world
+from moonteam.grid.macro.types import FAR
+from moonteam.planners import macro
+from moonteam.planners.base import Snapshot
+from moonteam.planners.pointing import problem_of
+from moonteam.planners.search.task import Task
+from moonteam.planners.search.travel import travel_times
+from moonteam.policies import pointer
+from moonteam.policies.policy import Policy
+
+
+@pytest.fixture(scope="module")
+def policy(pointing):
+    return Policy.load(pointing)
+
+
+def problem(seed=0, agents=3, targets=4):
+    moment = Snapshot.start(scenarios.generate(
+        seed, num_agents=agents, num_targets=targets, size=(9, 9), max_steps=90))
+    return problem_of(Task.of(moment, travel_times(moment)))
+
+
+@pytest.fixture(scope="module")
+def many():
+    return macro.stacked([problem(seed) for seed in range(5)])
+
+
+@partial(jax.jit, static_argnames="spec")
+def _decide(spec, params, state):
+    logits = pointer.point(params, spec, pointer.look(state, jnp.zeros(()))).logits
+    choice, options = world.choose(state, logits, jnp.zeros_like(logits))
+    return choice, options, world.step(state, choice)
+
+
+def by_hand(policy, one):
+    """(seconds, effort, order [N, M]) of the likeliest choices, decision by decision."""
+    state = jax.jit(world.reset)(jax.tree.map(jnp.asarray, one))
+    agents, targets = one.start.shape
+    order, effort, now = np.full((agents, targets), -1), 0.0, 0.0
+    for turn in range(50):
+        free = np.asarray(jax.jit(world.free)(state))
+        choice, _, result = _decide(policy.brain.spec, policy.params, state)
+        for a in np.flatnonzero(free & (np.asarray(choice) < targets)):
+            order[a, choice[a]] = turn
+        effort += float(result.effort)
+        now, state = float(state.now + result.seconds), result.state
+        if result.terminated:
+            return now, effort, order
+    raise AssertionError("it never ends")
+
+
+def test_rollouts_are_those_of_the_world_decision_by_decision(policy, many):
+    found = macro.rollouts(policy, many)
+    for b in range(5):
+        seconds, effort, order = by_hand(policy, jax.tree.map(lambda x, b=b: x[b], many))
+        assert found.solved[b, 0]
+        assert (found.seconds[b, 0], found.effort[b, 0]) == (seconds, effort)
+        assert found.order[b, 0].tolist() == order.tolist()
+
+
+def test_all_serve_who_set_out_and_the_last_service_ends_the_episode(policy, many):
+    found = macro.rollouts(policy, many, tries=8, heat=2.0, seed=1)
+    assert found.solved.all()
+    assert found.end.max(-1) == pytest.approx(found.seconds, abs=1e-3)
+    has = many.has[:, None, None] & found.team[..., None]  # [B, K, M, N, S]
+    there = has.sum(3)
+    assert (np.where(many.either[:, None, :, None], 0, many.need[:, None]) <= there).all()
+    assert ((there * many.need[:, None]).sum(-1) > 0).all()
+    assert len({found.order[0, k].tobytes() for k in range(8)}) > 1
+
+
+def test_a_seed_draws_the_same_whatever_the_pool(policy, many, monkeypatch):
+    whole = macro.rollouts(policy, many, tries=8, heat=2.0, seed=1)
+    monkeypatch.setattr(macro, "_PLACES", 3)
+    monkeypatch.setattr(macro, "_CHUNK", 16)
+    ticks = []
+    parts = macro.rollouts(policy, many, tries=8, heat=2.0, seed=1, tick=ticks.append)
+    assert ticks == [16, 16, 8]
+    assert np.array_equal(whole.order, parts.order)
+    assert np.array_equal(whole.seconds, parts.seconds)
+
+
+def test_padding_changes_no_choice(policy, many):
+    alone = macro.stacked([problem(0)])
+    other = macro.stacked([problem(0), problem(9, agents=4, targets=5)])
+    assert other.start.shape == (2, 4, 6)
+    small, large = macro.rollouts(policy, alone), macro.rollouts(policy, other)
+    assert large.routes(0)[:3, :4].tolist() == small.routes(0).tolist()
+    assert (large.routes(0)[3:] == -1).all()
+
+
+def test_sizes_are_few():
+    assert [macro.padded(n) for n in (0, 1, 3, 5, 6, 7, 9, 13, 17, 25)] == [
+        1, 1, 3, 6, 6, 8, 12, 16, 24, 32]
+
+
+def test_services_wait_for_what_comes_before_them_and_for_their_hour(policy):
+    one = problem(3)
+    after = np.zeros((4, 4), bool)
+    after[1, 0] = after[2, 1] = True  # 0, then 1, then 2
+    appears = np.array([0.0, 0.0, 0.0, 40.0], np.float32)
+    timed = macro.stacked([replace(one, after=after, appears=appears,
+                                   service=np.full(4, 2.5, np.float32))] * 5)
+    found = macro.rollouts(policy, timed, tries=8, heat=1.0)
+    assert found.solved.all()
+    assert (found.start[..., 1] >= found.end[..., 0] - 1e-3).all()
+    assert (found.start[..., 2] >= found.end[..., 1] - 1e-3).all()
+    assert (found.start[..., 3] >= 40.0).all()
+    assert found.end - found.start == pytest.approx(2.5)
+    assert found.end.max(-1) == pytest.approx(found.seconds, abs=1e-2)
+
+
+def test_nothing_to_do_and_nothing_that_can_be_done(policy, many):
+    hopeless = problem(4)
+    hopeless = replace(hopeless, start=np.full_like(hopeless.start, FAR))
+    idle = problem(5)
+    idle = replace(idle, target_mask=np.zeros(4, bool), need=np.zeros_like(idle.need))
+    found = macro.rollouts(policy, macro.stacked([hopeless, idle] + [problem(0)] * 3))
+    assert found.solved[:, 0].tolist() == [False, True, True, True, True]
+    assert found.seconds[1, 0] == 0.0
+    assert (found.routes(0) == -1).all()
+    assert not found.team[0].any()
+
+
+def test_only_pointing_policies_and_numbers_that_can_be(policy, many):
+    with pytest.raises(InputError, match="4097 is not allowed"):
+        macro.rollouts(policy, many, tries=4097)
+    other = replace(policy, brain=object(), source=replace(policy.source, kind="entity"))
+    with pytest.raises(InputError, match="one of kind pointer"):
+        macro.rollouts(other, many)
