@@ -60,6 +60,8 @@ def test_every_public_method_has_the_base_classs_parameters(jaxmarl, env):
 def test_episodes_end_and_begin_again(env):
     """Choices made at once, each allowed by itself: whose is not when its turn comes, waits."""
     observations, state = env.reset(jax.random.key(0))
+    step, step_env = jax.jit(env.step), jax.jit(env.step_env)
+    allowed = jax.jit(world.allowed)
     ended, spent = 0, 0.0
     for t in range(40):
         for i, agent in enumerate(env.agents):
@@ -68,11 +70,11 @@ def test_episodes_end_and_begin_again(env):
             assert bool(space.contains(observations[agent]))
             own = env.get_avail_actions(state)[agent]
             assert own.shape == (FAMILY.targets[1] + 1,)
-            assert own[:-1].tolist() == world.allowed(state, state.goal)[i].tolist()
+            assert own[:-1].tolist() == allowed(state, state.goal)[i].tolist()
             assert bool(own.any())
         actions = random_actions(env, state, jax.random.key(t))
         before = state
-        observations, state, rewards, dones, infos = env.step(jax.random.key(t), state, actions)
+        observations, state, rewards, dones, infos = step(jax.random.key(t), state, actions)
         assert set(dones) == {*env.agents, "__all__"}
         assert len({float(r) for r in rewards.values()}) == 1
         np.testing.assert_allclose(
@@ -80,7 +82,7 @@ def test_episodes_end_and_begin_again(env):
         spent += float(infos["seconds"][0])
         if bool(dones["__all__"]):
             assert all(map(bool, dones.values()))
-            kept, after, *_ = env.step_env(jax.random.key(t), before, actions)
+            kept, after, *_ = step_env(jax.random.key(t), before, actions)
             assert set(kept) == set(env.agents)
             assert bool(after.solved.all()) == bool(infos["terminated"][0])
             np.testing.assert_allclose(after.now, spent, rtol=1e-5)

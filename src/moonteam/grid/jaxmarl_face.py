@@ -98,6 +98,7 @@ class Face:
         """Discrete, one number an action."""
         return self.action_spaces[agent]
 
+    @partial(jax.jit, static_argnums=0)
     def reset(self, key: Array) -> tuple[ByAgent, Any]:
         """A new episode: observations by agent, and the state."""
         raise NotImplementedError
