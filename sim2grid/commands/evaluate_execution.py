@@ -53,7 +53,7 @@ class Args(Planning, Missions, Resumable, Reported):
     mode: tuple[Literal["barrier", "async", "clock"], ...] = ("barrier",)
     """barrier: all robots decide together; async: each when it arrives (closed, oracle); clock: a
     decision is a target, planned in seconds and driven at any angle (closed; exact in place of
-    the policy)."""
+    policies that do not point at targets)."""
     planner: tuple[str, ...] = ("policy",)
     """Who decides: registered planners (policy, exact, greedy, lns, cpsat, exhaustive,
     another package's), or

@@ -58,7 +58,7 @@ class Args(Planning, Printed):
     another package's), or FILE.py:OBJECT. Default: policy; by the clock exact."""
     mode: Literal["barrier", "async", "clock"] | None = None
     """barrier: all robots decide together; async: each decides when it arrives; clock: a decision
-    is a target, planned in seconds and driven at any angle (not by the policy). Default: clock
+    is a target, planned in seconds and driven at any angle. Default: clock
     where the mission says clock: seconds, else barrier."""
     backend: Literal["mjx", "native", "fused"] = "mjx"
     """Physics engine: MJX (JAX), C MuJoCo, which is faster on a CPU, or the whole loop on MJX as
@@ -175,9 +175,6 @@ def _check(args: Args) -> None:
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise InputError("--out", f"{args.out} is a file; a folder is needed")
     parse(args.decode)
-    if args.mode == "clock" and args.planner == "policy":
-        raise InputError("--planner policy", "decides in steps; by the clock exact, greedy, lns, "
-                         "cpsat, or FILE.py:OBJECT")
     if args.mode == "clock" and args.backend == "fused":
         raise InputError("--backend fused", "drives in steps; by the clock mjx or native")
     if args.backend == "fused" and args.viewer:
@@ -241,9 +238,10 @@ def _by_the_clock(args: Args, mission: Mission) -> Run:
     prepared = prepare(by_the_clock(mission, args.mission), args.mission)
     planner = registry.find(name).make(args.planner_options(args.seed))
     execution = execution_of(prepared, Keeper(planner), args.seed)
-    return Run(prepared, execution, prepared.scene.qpos0, None, name, args.objective,
-               args.backend, args.seed, f"{mission.name}: {name}, by the clock",
-               command.line("rollout", args))
+    who = name if name != "policy" else f"policy {Path(args.policy).stem}"
+    return Run(prepared, execution, prepared.scene.qpos0, None, name,
+               None if name == "policy" else args.objective, args.backend, args.seed,
+               f"{mission.name}: {who}, by the clock", command.line("rollout", args))
 
 
 def _from_report(args: Args) -> Run:

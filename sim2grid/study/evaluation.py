@@ -34,6 +34,7 @@ from moonteam.planners.base import Objective, Planner
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.base import MS
+from moonteam.policies.brain import PointerBrain
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
 from moonteam.robots import team
@@ -380,15 +381,23 @@ def chooser(contender: Contender) -> Keeper:
     return Keeper(timed_planners.find(contender.planner).make(contender.options))
 
 
-def contenders(loops: Iterable[Loop], modes: Iterable[Mode], planners: Iterable[Contender],
+def points(who: Contender) -> bool:
+    """Whether it can decide by the clock: all planners but policies of other kinds can."""
+    if who.planner != "policy":
+        return True
+    return isinstance(who.options.loaded().brain, PointerBrain)
+
+
+def contenders(loops: Iterable[Loop], modes: Sequence[Mode], planners: Iterable[Contender],
                backends: Sequence[str] = ("native",)) -> list[Contender]:
     """All combinations that mean something, each once; `planners` give who decides.
 
-    Policies decide in steps: by the clock the exact planner stands in where there are no others.
+    By the clock, of policies only those that point at targets decide, and the exact planner stands
+    in where nobody does.
     """
     found: dict[str, Contender] = {}
     planners, exact = list(planners), Contender("oracle", "barrier", "exact")
-    by_the_clock = [who for who in planners if who.planner != "policy"] or [exact]
+    by_the_clock = [who for who in planners if "clock" in modes and points(who)] or [exact]
     for loop in loops:
         for mode, backend in itertools.product(
                 modes if loop in ("closed", "oracle") else ("barrier",),

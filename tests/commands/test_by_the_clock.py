@@ -2,11 +2,13 @@
 
 import json
 
+import jax
 import msgspec
 import numpy as np
 import pytest
 
 from moonteam.cli import main
+from moonteam.policies import pointer, policy_file
 
 TINY = """
 name: tiny
@@ -33,6 +35,16 @@ def tiny(tmp_path):
     file = tmp_path / "tiny.yaml"
     file.write_text(TINY)
     return str(file)
+
+
+@pytest.fixture(scope="module")
+def pointing(tmp_path_factory):
+    """A policy file of the kind that plans by the clock, untrained."""
+    sizes = {"width": 8, "heads": 2, "layers": 1, "pairs": 4}
+    path = tmp_path_factory.mktemp("policy") / "fresh.safetensors"
+    params = jax.device_get(pointer.init(pointer.PointerSpec(**sizes), jax.random.key(0)))
+    policy_file.save_policy(path, policy_file.PolicyFile("pointer", sizes, params))
+    return str(path)
 
 
 def test_a_mission_is_planned_on_its_ground(tiny, capsys, tmp_path):
@@ -76,10 +88,10 @@ def test_no_robot_is_faster_than_its_kind(tiny, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(("words", "says"), [
-    (["plan", "TINY", "--planner", "policy"], "decides in steps; by the clock: exact"),
+    (["plan", "TINY", "--planner", "policy"], "one of kind pointer is needed"),
     (["plan", "TINY", "--clock", "steps"], "is by the clock"),
     (["plan", "TINY", "--planner", "exakt"], "did you mean exact"),
-    (["rollout", "TINY", "--planner", "policy"], "decides in steps"),
+    (["rollout", "TINY", "--planner", "policy"], "one of kind pointer is needed"),
     (["rollout", "TINY", "--mode", "barrier"], "is by the clock"),
     (["rollout", "TINY", "--backend", "fused"], "drives in steps"),
     (["evaluate", "execution", "--mode", "clock", "--lose", "1", "--count", "1"], "at_s")])
@@ -88,6 +100,42 @@ def test_what_cannot_be_is_one_line(words, says, tiny, capsys):
     message = capsys.readouterr().err
     assert says in message
     assert message.count("\n") == 1
+
+
+def test_a_policy_that_points_plans_and_drives(tiny, pointing, capsys):
+    words = [tiny, "--planner", "policy", "--policy", pointing]
+    plan = printed(capsys, "plan", *words)
+    assert (plan["planner"], plan["status"], plan["bound"]) == ("policy", "feasible", None)
+    look, core = sorted(plan["schedule"], key=lambda one: one["target"])
+    assert core["start"] >= look["end"]
+    report = printed(capsys, "rollout", *words, "--backend", "native", "--no-video")
+    assert report["success"]
+    assert report["planner"] == "policy"
+    assert report["expected_s"] == pytest.approx(plan["makespan"], abs=6)
+
+
+def test_a_policy_stands_beside_planners_by_the_clock(pointing, capsys):
+    document = printed(capsys, "evaluate", "grid", "seconds/3x5-7", "--limit", "2", "--planner",
+                       "exact", "--planner", "policy", "--policy", pointing, "--decode", "argmax",
+                       "--decode", "best-of-4")
+    exact, argmax, best = document["summary"]
+    assert [argmax["planner"], best["planner"]] == ["policy(argmax)", "policy(best-of-4)"]
+    assert exact["makespan_gap"] == pytest.approx(0.0, abs=1e-6)
+    assert min(argmax["makespan_gap"], best["makespan_gap"]) >= 0
+    assert argmax["success"] == best["success"] == 1
+    peers = printed(capsys, "evaluate", "peers", "peers/mrta-benchmark", "--limit", "1",
+                    "--planner", "policy", "--policy", pointing)
+    assert [row["name"] for row in peers["sets"][0]["planners"]] == ["policy(argmax)"]
+    assert peers["sets"][0]["planners"][0]["problems"] == 1
+
+
+def test_a_policy_drives_by_the_clock_and_in_steps(pointing, capsys):
+    words = ["evaluate", "execution", "--count", "1", "--targets", "2", "--side", "10", "--site",
+             "flat", "--mode", "clock"]
+    document = printed(capsys, *words, "--policy", pointing)
+    assert [row["contender"] for row in document["rows"]] == ["closed fresh clock"]
+    other = printed(capsys, *words)
+    assert [row["contender"] for row in other["rows"]] == ["closed exact clock"]
 
 
 def test_real_robots_do_it_as_planned(tiny, capsys, tmp_path):

@@ -4,14 +4,17 @@ import json
 
 import pytest
 
-from moonteam import cli, paths
-from moonteam.commands.testsets import NAMES
+from moonteam import cli, loading, paths
+from moonteam.commands import testsets_seconds
+from moonteam.commands.testsets import ALL, NAMES
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.lns import LnsPlanner
 from moonteam.planners.search import bounds
 from moonteam.planners.search.task import Task
 from moonteam.planners.search.travel import travel_times
+from moonteam.planners.seconds import base, exact
+from moonteam.problem import timed
 from moonteam.problem.scenario import Optimal, load_set
 
 FOLDER = paths.assets() / "testsets"
@@ -19,7 +22,7 @@ INDEX = json.loads((FOLDER / "index.json").read_text())
 
 
 def test_the_index_names_every_set():
-    assert set(INDEX) == set(NAMES)
+    assert set(INDEX) == set(ALL)
     assert [INDEX[name]["count"] for name in ("3x5", "3x6", "3x7")] == [1000] * 3
 
 
@@ -48,21 +51,39 @@ def test_shipped_sets_hold_what_the_index_says(name):
         assert quick.makespan >= s.optimal.bound_makespan
 
 
+@pytest.mark.parametrize("name", testsets_seconds.NAMES)
+def test_shipped_sets_by_the_clock_hold_what_the_index_says(name):
+    entry, path = INDEX[name], FOLDER / f"{name}.jsonl"
+    found = timed.load_set(path)
+    assert len(found) == len({one.id for one in found}) == entry["count"] == 1000
+    assert {len(one.agents) for one in found} == {entry["agents"]}
+    assert {len(one.targets) for one in found} == set(
+        range(entry["targets"][0], entry["targets"][1] + 1))
+    assert {agent.speed for one in found for agent in one.agents} == set(entry["speeds"])
+    assert path.stat().st_size < 1_000_000
+    for one in found[::250]:
+        plan = exact.ExactPlanner().plan(base.moment(one))
+        assert plan.makespan == round(base.MS * one.optimal.makespan)
+
+
 def test_making_sets_twice_gives_the_same_files(capsys, tmp_path):
-    words = ["--seed", "3", "--sets", "2x3", "3x6-blocked", "--count", "4", "--json"]
+    words = ["--seed", "3", "--count", "4", "--json",
+             "--sets", "2x3", "3x6-blocked", "seconds/3x5-7"]
     assert cli.main(["testsets", "--out", str(tmp_path / "a"), *words]) == 0
     assert cli.main(["testsets", "--out", str(tmp_path / "b"), *words]) == 0
     index = json.loads(capsys.readouterr().out.splitlines()[0])
-    assert sorted(index) == ["2x3", "3x6-blocked"]
+    assert sorted(index) == ["2x3", "3x6-blocked", "seconds/3x5-7"]
     for name in index:
         one, two = ((tmp_path / side / f"{name}.jsonl").read_text() for side in "ab")
         assert one == two
-        found = load_set(tmp_path / "a" / f"{name}.jsonl")
+        found = loading.load_set(tmp_path / "a" / f"{name}.jsonl")
         assert len(found) == 4
-        assert all(isinstance(s.optimal, Optimal) and s.optimal.makespan for s in found)
+        assert all(isinstance(s.optimal, Optimal | timed.Known) and s.optimal.makespan
+                   for s in found)
 
 
-@pytest.mark.parametrize("words", [["--sets", "9x9"], ["--count", "0"], ["--seed", "-1"]])
+@pytest.mark.parametrize("words", [["--sets", "9x9"], ["--count", "0"], ["--seed", "-1"],
+                                   ["--speeds", "0"]])
 def test_wrong_options_of_testsets(capsys, tmp_path, words):
     assert cli.main(["testsets", "--out", str(tmp_path / "sets"), *words]) == 2
     assert "is not allowed" in capsys.readouterr().err

@@ -134,9 +134,9 @@ def test_planners_of_ours_are_found_and_take_their_options(name):
 
 
 def test_small_sets_are_planned_by_exact_too_where_no_planner_is_named(problems):
-    assert [row.name for row in peers.contenders(problems, (), (), 0)] == ["exact", "lns"]
+    assert [row.name for row in peers.contenders(problems, Options(()))] == ["exact", "lns"]
     large = loading.load("peers/heteromrta")
-    assert [row.name for row in peers.contenders(large, (), (0.5, 2.0), 0)] == [
+    assert [row.name for row in peers.contenders(large, Options((), time_limits=(0.5, 2.0)))] == [
         "lns(0.5 s)", "lns(2 s)"]
 
 

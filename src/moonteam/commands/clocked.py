@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from moonteam import files
+from moonteam import compilation, files
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import MS, Moment, TimedPlan, moment, timed_again
 from moonteam.problem.mission import Mission
@@ -84,10 +84,9 @@ def make_plan(name: str, options: PlannerOptions, now: Moment) -> TimedPlan:
     """The plan of a planner by the clock. Raises InputError."""
     from moonteam.planners.seconds import registry
 
-    if name == "policy":
-        raise InputError("--planner policy", "decides in steps; by the clock: "
-                         + ", ".join(registry.names()))
     kind = registry.find(name)
+    if kind.wants_policy:
+        compilation.enable_cache()
     count = int((~now.solved).sum())
     if kind.most_targets is not None and count > kind.most_targets:
         raise InputError(f"--planner {name}", f"{count} targets; it takes up to "

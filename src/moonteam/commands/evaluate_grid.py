@@ -28,7 +28,8 @@ class Args(Drawn, Limited, Reported):
     may be given several times.
 
     Of a set by the clock (its objects say "clock": "seconds"), makespan and effort are in its
-    own unit of time, and planners are those by the clock: exact, greedy, lns, cpsat, exhaustive.
+    own unit of time, and planners are those by the clock: exact, greedy, lns, cpsat, exhaustive,
+    and policy with a network that points at targets.
 
     Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png.
 
@@ -108,9 +109,9 @@ def options_of(args: Any) -> Any:
     from moonteam.evaluation.contenders import Options
 
     return Options(
-        planners=args.planner or ("exact",), objectives=args.objective,
+        planners=args.planner or ("exact",), objectives=getattr(args, "objective", ()),
         policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
-        preferences=args.preference, decodes=args.decode or ("argmax",),
+        preferences=getattr(args, "preference", ()), decodes=args.decode or ("argmax",),
         alpha=getattr(args, "alpha", 1.0), beta=getattr(args, "beta", 0.05),
         time_limits=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False))
 

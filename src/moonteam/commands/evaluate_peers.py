@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
@@ -31,16 +31,23 @@ class Args(Seeded, Limited, Reported):
       moonteam evaluate peers
       moonteam evaluate peers dcmrta.jsonl --planner lns --time-limit 1 --time-limit 10
       moonteam evaluate peers peers/mrta-benchmark --planner exact --json
+      moonteam evaluate peers --planner lns --planner policy --policy mine.safetensors
     """
 
     sets: tyro.conf.Positional[tuple[str, ...]] = ()
     """Sets by the clock with published results (.jsonl), or names of bundled ones; the bundled
     ones if not given."""
     planner: Many[tuple[str, ...]] = ()
-    """Planner by the clock, or FILE.py:OBJECT; again for more. Default: exact on sets of at most
-    10 targets, and lns."""
+    """Planner by the clock (policy is one), or FILE.py:OBJECT; again for more. Default: exact on
+    sets of at most 10 targets, and lns."""
     time_limit: Many[tuple[float, ...]] = ()
     """Seconds a problem that anytime planners may take; again for more. Default: theirs; lns: 1."""
+    policy: Many[tuple[str, ...]] = ()
+    """For --planner policy: policy file (.safetensors) or the name of a bundled policy; again for
+    more. Default: any_team."""
+    decode: Many[tuple[str, ...]] = ()
+    """For --planner policy: argmax, sample, best-of-K such as best-of-16; @T sets the temperature
+    of drawing; again for more rows. Default: argmax."""
 
 
 def bundled() -> tuple[str, ...]:
@@ -65,11 +72,13 @@ def run(args: Args) -> int:
     if args.limit is not None and args.limit < 1:
         raise InputError("--limit", f"{args.limit} is not allowed; at least 1")
     compilation.enable_cache()
+    from moonteam.commands.evaluate_grid import options_of
     from moonteam.evaluation import peers
     from moonteam.report import command, provenance, tables
 
     sets = {Path(name).stem: load(name, args.limit) for name in args.sets or bundled()}
-    rows = {name: peers.contenders(found, args.planner, args.time_limit, args.seed)
+    asked = replace(options_of(args), planners=args.planner)
+    rows = {name: peers.contenders(found, asked)
             for name, found in sets.items()}
     done, lacking = peers.run_all(sets, rows, args.seed)
     document: dict = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,8 +14,10 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from moonteam import files
+from moonteam.commands import testsets_seconds
 from moonteam.commands.options import Printed
 from moonteam.errors import InputError
+from moonteam.problem import timed
 from moonteam.problem.scenario import Optimal, Scenario, save_set
 from moonteam.report import progress
 
@@ -55,6 +58,7 @@ RECIPES = (
     Recipe(5, 20, 100, certified=False), Recipe(8, 40, 100, certified=False),
 )
 NAMES = tuple(recipe.name() for recipe in RECIPES)
+ALL = NAMES + testsets_seconds.NAMES
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,13 @@ class Args(Printed):
     steps. The sets too large for it hold the best values known (large-neighbourhood search
     with --iterations, from several starts) and lower bounds.
 
+    The sets in the folder seconds are by the clock: robots of unlike speeds on straight ways,
+    with the least makespan in seconds.
+
     Examples:
       moonteam testsets --out assets/testsets --seed 0
       moonteam testsets --out /tmp/sets --sets 3x5 3x6-blocked --count 20
+      moonteam testsets --out /tmp/sets --sets seconds/3x5-7 --speeds 2.0 0.4 0.5
     """
 
     out: Path
@@ -77,7 +85,7 @@ class Args(Printed):
     seed: int = 0
     """Seed of the draws; each set has its own stream."""
 
-    sets: tuple[str, ...] = NAMES
+    sets: tuple[str, ...] = ALL
     """Which sets to make."""
 
     count: int | None = None
@@ -89,6 +97,9 @@ class Args(Printed):
     starts: int = 2
     """Starts of the large-neighbourhood search."""
 
+    speeds: tuple[float, ...] = testsets_seconds.SPEEDS
+    """m/s of which each robot of a set by the clock draws one: what a drone, a walker and a rover
+    make over open ground."""
 
 
 def draws(recipe: Recipe, seed: int) -> Iterator[Scenario]:
@@ -161,9 +172,12 @@ def make(recipe: Recipe, args: Args, update: Callable[[int, str], None]) -> list
 
 def run(args: Args) -> int:
     """Makes the sets asked for; returns 0."""
-    unknown = [name for name in args.sets if name not in NAMES]
+    unknown = [name for name in args.sets if name not in ALL]
     if unknown:
-        raise InputError("--sets", f"{unknown[0]!r} is not allowed; " + ", ".join(NAMES))
+        raise InputError("--sets", f"{unknown[0]!r} is not allowed; " + ", ".join(ALL))
+    slow = [speed for speed in args.speeds if not 0 < speed < math.inf]
+    if slow or not args.speeds:
+        raise InputError("--speeds", f"{slow or 'nothing'} is not allowed; m/s above 0")
     for option, value in (("--count", args.count), ("--iterations", args.iterations),
                           ("--starts", args.starts)):
         if value is not None and value < 1:
@@ -172,20 +186,32 @@ def run(args: Args) -> int:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
     index_path = args.out / "index.json"
     index = json.loads(files.read_text(index_path)) if index_path.exists() else {}
-    for recipe in RECIPES:
+    for recipe in (*RECIPES, *testsets_seconds.RECIPES):
         name = recipe.name()
         if name not in args.sets:
             continue
         with progress.bar(name, args.count or recipe.count) as update:
-            scenarios = make(recipe, args, update)
-        save_set(args.out / f"{name}.jsonl", scenarios)
-        index[name] = describe(recipe, args, scenarios)
+            index[name] = make_one(recipe, args, update)
         files.write_json(index_path, dict(sorted(index.items())))
         if not args.json:
             print(summary(name, index[name]), flush=True)
     if args.json:
         print(files.dump_json(index))
     return 0
+
+
+def make_one(recipe: Recipe | testsets_seconds.Recipe, args: Args,
+             update: Callable[[int, str], None]) -> dict:
+    """Makes and writes one set; what the index says about it."""
+    path = args.out / f"{recipe.name()}.jsonl"
+    if isinstance(recipe, Recipe):
+        scenarios = make(recipe, args, update)
+        save_set(path, scenarios)
+        return describe(recipe, args, scenarios)
+    problems = testsets_seconds.make(recipe, args.count or recipe.count, args.seed, args.speeds,
+                                     update)
+    timed.save_set(path, problems)
+    return testsets_seconds.describe(recipe, args.seed, args.speeds, problems)
 
 
 def describe(recipe: Recipe, args: Args, scenarios: list[Scenario]) -> dict:

@@ -201,7 +201,7 @@ def contenders(options: Options) -> list[Contender]:
     found: list[Contender] = []
     for planner in dict.fromkeys(options.planners):
         kind = registry.find(planner)
-        found += _policies(options, given) if kind.name == POLICY else _planned(
+        found += policies(options, given) if kind.name == POLICY else _planned(
             planner, kind, options, given or MAKESPAN)
     if options.policies and not any(registry.find(p).wants_policy for p in options.planners):
         raise InputError("--policy", f"has no effect without --planner {POLICY}")
@@ -231,14 +231,14 @@ def called(path: Path) -> str:
     return path.absolute().parent.name if path.stem == "policy" else path.stem
 
 
-def _policies(options: Options, objectives: Sequence[Objective]) -> list[Contender]:
+def policies(options: Options, objectives: Sequence[Objective]) -> list[Learned]:
     """The rows of every policy file, preference and decoding."""
     decodes = [decoding.parse(text) for text in dict.fromkeys(options.decodes)]
     files = options.policies or [paths.find(DEFAULT_POLICY, "policies", ".safetensors")]
-    policies = [Policy.load(path) for path in files]
-    found: list[Contender] = []
-    for path, policy in zip(files, policies, strict=True):
-        stem = "policy" if len(policies) == 1 else called(path)
+    loaded = [Policy.load(path) for path in files]
+    found: list[Learned] = []
+    for path, policy in zip(files, loaded, strict=True):
+        stem = "policy" if len(loaded) == 1 else called(path)
         given = options.preferences if policy.brain.prefers else ()
         for preference in given or (0.0,):
             for decode in decodes:

@@ -31,12 +31,11 @@ NOTES = [
     "Published figures were measured by their authors, on their machines, under their time limits."]
 
 
-def contenders(problems: Sequence[Timed], planners: Sequence[str], limits: Sequence[float],
-               seed: int) -> list[Contender]:
-    """The rows of one set. Raises InputError for what cannot be."""
+def contenders(problems: Sequence[Timed], options: Options) -> list[Contender]:
+    """The rows of one set, of the usual planners if none is named. Raises InputError."""
     small = max(len(problem.targets) for problem in problems) <= MOST_EXACT
-    chosen = planners or (("exact", "lns") if small else ("lns",))
-    found = timed.contenders(Options(chosen, time_limits=limits, seed=seed))
+    usual = ("exact", "lns") if small else ("lns",)
+    found = timed.contenders(replace(options, planners=options.planners or usual))
     timed.check(problems, found)
     return [replace(row, name=row.name.replace("(makespan)", "").replace("makespan, ", ""))
             for row in found]

@@ -6,14 +6,17 @@ import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.evaluation.contenders import MAKESPAN, Options
+from moonteam.evaluation.contenders import MAKESPAN, Options, policies
 from moonteam.planners.base import Objective, check_objective
+from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.seconds import base, registry
-from moonteam.planners.seconds.base import MS, TimedPlanner
+from moonteam.planners.seconds.base import MS, Moment, TimedPlan, TimedPlanner
+from moonteam.planners.seconds.registry import TimedPlannerKind
 from moonteam.problem.timed import Agent, Target, Timed
 from moonteam.report import provenance, tables
 from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure
@@ -64,23 +67,49 @@ class Contender:
     planner: TimedPlanner
     most_targets: int | None = None
 
+    alone: bool = False
+    """Problems are planned one at a time by planners that can take many at once, too."""
+
+    @property
+    def together(self) -> bool:
+        """Whether it plans a whole set in one call."""
+        return not self.alone and callable(getattr(self.planner, "plans", None))
+
     def plan(self, problem: Timed) -> Result:
-        """One problem, planned and judged; nothing of the planner's promise is believed."""
+        """One problem, planned and judged."""
         now = base.moment(problem)
         began = time.perf_counter()
         plan = self.planner.plan(now)
-        seconds = time.perf_counter() - began
-        wrong = "; ".join(base.problems(now, plan.services)) if plan.status != "infeasible" else ""
-        if wrong or plan.status == "infeasible":
-            return Result(problem.id, False, None, None, plan.status, seconds, wrong)
-        return Result(problem.id, True, base.makespan(now, plan.services) / MS,
-                      base.effort(now, plan.services) / MS, plan.status, seconds)
+        return judged(problem, now, plan, time.perf_counter() - began)
 
-    def warm(self) -> float:
+    def plan_all(self, problems: Sequence[Timed]) -> list[Result]:
+        """A whole set, planned in one call and judged; each has its share of the time."""
+        moments = [base.moment(problem) for problem in problems]
+        began = time.perf_counter()
+        plans = cast(Any, self.planner).plans(moments)
+        share = (time.perf_counter() - began) / max(len(problems), 1)
+        return [judged(*one, share) for one in zip(problems, moments, plans, strict=True)]
+
+    def warm(self, problems: Sequence[Timed]) -> float:
         """s of the first call, which loads and compiles."""
         began = time.perf_counter()
-        self.planner.plan(base.moment(WARM))
+        if self.together:
+            cast(Any, self.planner).plans([base.moment(problem) for problem in problems])
+        elif self.alone:  # what is compiled, is for each size
+            for problem in {(len(p.agents), len(p.targets)): p for p in problems}.values():
+                self.planner.plan(base.moment(problem))
+        else:
+            self.planner.plan(base.moment(WARM))
         return time.perf_counter() - began
+
+
+def judged(problem: Timed, now: Moment, plan: TimedPlan, seconds: float) -> Result:
+    """A plan's result; nothing of the planner's promise is believed."""
+    wrong = "; ".join(base.problems(now, plan.services)) if plan.status != "infeasible" else ""
+    if wrong or plan.status == "infeasible":
+        return Result(problem.id, False, None, None, plan.status, seconds, wrong)
+    return Result(problem.id, True, base.makespan(now, plan.services) / MS,
+                  base.effort(now, plan.services) / MS, plan.status, seconds)
 
 
 @dataclass
@@ -94,29 +123,52 @@ class Outcomes:
 
 def contenders(options: Options) -> list[Contender]:
     """All rows asked for. Raises InputError at the first wrong name or number."""
-    for option, given in (("--policy", options.policies), ("--preference", options.preferences),
-                          ("--decode", options.decodes != ("argmax",)),
-                          ("--alone", options.alone)):
-        if given:
-            raise InputError(option, "has no effect on problems by the clock, which no policy "
-                             "plans yet")
     given = ["moves" if one == "effort" else one for one in options.objectives]
     objectives: Sequence[Objective] = [
-        check_objective(one, options.alpha, options.beta) for one in dict.fromkeys(given)
-    ] or MAKESPAN
+        check_objective(one, options.alpha, options.beta) for one in dict.fromkeys(given)]
+    kinds = [registry.find(name) for name in dict.fromkeys(options.planners)]
+    _check_options(options, kinds)
     found = []
-    for name in dict.fromkeys(options.planners):
-        kind = registry.find(name)
-        limits = [*dict.fromkeys(options.time_limits)] if kind.anytime else []
-        for objective, limit in itertools.product(objectives, limits or [None]):
-            words = ["effort" if objective == "moves" else objective]
-            words += [f"{limit:g} s"] if len(limits) > 1 else []
-            found.append(Contender(f"{kind.name}({', '.join(words)})", kind.make(
-                options.of(objective, limit)), kind.most_targets))
+    for kind in kinds:
+        found += _policies(kind, options, objectives) if kind.wants_policy else _planned(
+            kind, options, objectives or MAKESPAN)
     names = [one.name for one in found]
     if len(set(names)) < len(names):
         raise InputError("--planner", "two rows would have the same name; rename one")
     return found
+
+
+def _check_options(options: Options, kinds: Sequence[TimedPlannerKind]) -> None:
+    """Raises InputError for options that would have no effect."""
+    if any(kind.wants_policy for kind in kinds):
+        return
+    for option, given in (("--policy", options.policies), ("--preference", options.preferences),
+                          ("--decode", tuple(options.decodes) != ("argmax",)),
+                          ("--alone", options.alone)):
+        if given:
+            raise InputError(option, "has no effect without --planner policy")
+
+
+def _planned(kind: TimedPlannerKind, options: Options, objectives: Sequence[Objective]
+             ) -> list[Contender]:
+    """The rows of a planner: every objective and, if it is anytime, limit."""
+    limits = [*dict.fromkeys(options.time_limits)] if kind.anytime else []
+    found = []
+    for objective, limit in itertools.product(objectives, limits or [None]):
+        words = ["effort" if objective == "moves" else objective]
+        words += [f"{limit:g} s"] if len(limits) > 1 else []
+        found.append(Contender(f"{kind.name}({', '.join(words)})", kind.make(
+            options.of(objective, limit)), kind.most_targets))
+    return found
+
+
+def _policies(kind: TimedPlannerKind, options: Options, objectives: Sequence[Objective]
+              ) -> list[Contender]:
+    """The rows of a planner that decides by a policy, as for scenarios in steps."""
+    return [Contender(row.name, kind.make(PlannerOptions(
+        row.objective, options.alpha, options.beta, seed=options.seed, policy=row.policy,
+        decode=row.decode.name, preference=row.preference)), alone=options.alone)
+        for row in policies(options, objectives)]
 
 
 def check(problems: Sequence[Timed], rows: Sequence[Contender]) -> None:
@@ -134,8 +186,11 @@ def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = "
     found: list[Outcomes] = []
     try:
         for row in rows:
-            done = Outcomes(row.name, row.warm())
+            done = Outcomes(row.name, row.warm(problems))
             found.append(done)
+            if row.together:
+                done.results += row.plan_all(problems)
+                continue
             for problem in track(problems, f"{title} {row.name}".strip(), len(problems)):
                 done.results.append(row.plan(problem))
     except KeyboardInterrupt:
@@ -161,7 +216,10 @@ def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, ti
              "Makespan: when the last service has ended and everybody with a home is there; "
              "effort: the team's time under way; both in the set's own unit of time.",
              f"In brackets: 95 % bootstrap intervals over {len(problems)} problems, "
-             f"{RESAMPLES} resamples.", *faults(found)]
+             f"{RESAMPLES} resamples.",
+             *(f"{row.name}: planning time is the whole set's, planned in one call, over its "
+               "problems; --alone plans one at a time." for row in rows if row.together),
+             *faults(found)]
     lacking = [row.name for row in rows if row.name not in whole(found, len(problems))]
     return {
         "title": title, "summary": [summary(one, optimal, bootstrap) for one in found],

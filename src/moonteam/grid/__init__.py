@@ -10,6 +10,7 @@ result = grid.step(config, state, actions)
 from moonteam.grid.config import EnvConfig, Phase, RewardWeights, observation_length
 from moonteam.grid.env import STAY, available, renew, reset, reset_to, step
 from moonteam.grid.jaxmarl_face import MoonGrid
+from moonteam.grid.jaxmarl_macro import MoonMacro
 from moonteam.grid.observe import observe
 from moonteam.grid.rewards import PRESETS, TERMS, RewardPreset, preset, preset_config
 from moonteam.grid.sampling import sample
@@ -31,6 +32,7 @@ __all__ = [
     "Buffer",
     "EnvConfig",
     "MoonGrid",
+    "MoonMacro",
     "Phase",
     "Problem",
     "RewardPreset",

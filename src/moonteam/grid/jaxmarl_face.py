@@ -64,35 +64,26 @@ class Spaces(Protocol):
     Box: Any
 
 
-class _OwnSpaces:
+class OwnSpaces:
+    """Those of this module."""
+
     Discrete = Discrete
     Box = Box
 
 
-class MoonGrid:
-    """The grid as a JaxMARL environment.
+class Face:
+    """What our environments have in common: agents, their spaces, the automatic reset."""
 
-    Args:
-      config: the family of problems that `reset` samples, and the rewards.
-      spaces: where `Discrete` and `Box` come from. Wrappers that look at the class of a
-        space (JaxMARL's CTRolloutManager) need `jaxmarl.environments.spaces` here.
-    """
-
-    def __init__(self, config: EnvConfig | None = None, spaces: Spaces | None = None):
-        self.config = config or EnvConfig()
-        self.num_agents = self.config.num_agents
-        self.agents = [f"agent_{i}" for i in range(self.num_agents)]
-        maker = spaces or _OwnSpaces
-        bound = float(max(self.config.width - 1, self.config.height - 1,
-                          2**self.config.num_skills - 1))
-        shape = (self.config.obs_dim,)
-        self.observation_spaces = {a: maker.Box(-bound, bound, shape) for a in self.agents}
-        self.action_spaces = {a: maker.Discrete(NUM_ACTIONS) for a in self.agents}
+    def __init__(self, num_agents: int, observation: Any, action: Any):
+        self.num_agents = num_agents
+        self.agents = [f"agent_{i}" for i in range(num_agents)]
+        self.observation_spaces = dict.fromkeys(self.agents, observation)
+        self.action_spaces = dict.fromkeys(self.agents, action)
 
     @property
     def name(self) -> str:
         """The environment's name."""
-        return "MoonGrid"
+        return type(self).__name__
 
     @property
     def agent_classes(self) -> dict[str, list[str]]:
@@ -104,18 +95,26 @@ class MoonGrid:
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Discrete(5): up, down, left, right, stay."""
+        """Discrete, one number an action."""
         return self.action_spaces[agent]
 
     @partial(jax.jit, static_argnums=0)
-    def reset(self, key: Array) -> tuple[ByAgent, State]:
+    def reset(self, key: Array) -> tuple[ByAgent, Any]:
         """A new episode: observations by agent, and the state."""
-        state, observation = env.reset(self.config, key)
-        return self._split(observation), state
+        raise NotImplementedError
+
+    def step_env(self, key: Array, state: Any, actions: ByAgent,
+                 ) -> tuple[ByAgent, Any, ByAgent, ByAgent, dict[str, Array]]:
+        """One step without a new episode."""
+        raise NotImplementedError
+
+    def get_obs(self, state: Any) -> ByAgent:
+        """Observations [D] by agent."""
+        raise NotImplementedError
 
     @partial(jax.jit, static_argnums=0)
-    def step(self, key: Array, state: State, actions: ByAgent, reset_state: State | None = None,
-             ) -> tuple[ByAgent, State, ByAgent, ByAgent, dict[str, Array]]:
+    def step(self, key: Array, state: Any, actions: ByAgent, reset_state: Any = None,
+             ) -> tuple[ByAgent, Any, ByAgent, ByAgent, dict[str, Array]]:
         """One step, and a new episode where this one ended.
 
         Args:
@@ -126,7 +125,7 @@ class MoonGrid:
 
         Returns:
           Observations (of the new episode where one began), state, rewards, dones with
-          "__all__", and infos: [N] arrays `terminated`, `truncated` and `true_moves`.
+          "__all__", and infos, see `step_env`.
         """
         _, key_reset = jax.random.split(key)
         observations, after, rewards, dones, infos = self.step_env(key, state, actions)
@@ -140,9 +139,40 @@ class MoonGrid:
             (fresh, fresh_observations), (after, observations))
         return observations, after, rewards, dones, infos
 
+    def _split(self, values: Array) -> ByAgent:
+        return {agent: values[i] for i, agent in enumerate(self.agents)}
+
+
+class MoonGrid(Face):
+    """The grid as a JaxMARL environment; actions are up, down, left, right, stay.
+
+    Args:
+      config: the family of problems that `reset` samples, and the rewards.
+      spaces: where `Discrete` and `Box` come from. Wrappers that look at the class of a
+        space (JaxMARL's CTRolloutManager) need `jaxmarl.environments.spaces` here.
+    """
+
+    def __init__(self, config: EnvConfig | None = None, spaces: Spaces | None = None):
+        self.config = config or EnvConfig()
+        maker = spaces or OwnSpaces
+        bound = float(max(self.config.width - 1, self.config.height - 1,
+                          2**self.config.num_skills - 1))
+        super().__init__(self.config.num_agents,
+                         maker.Box(-bound, bound, (self.config.obs_dim,)),
+                         maker.Discrete(NUM_ACTIONS))
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: Array) -> tuple[ByAgent, State]:
+        """A new episode: observations by agent, and the state."""
+        state, observation = env.reset(self.config, key)
+        return self._split(observation), state
+
     def step_env(self, key: Array, state: State, actions: ByAgent,
                  ) -> tuple[ByAgent, State, ByAgent, ByAgent, dict[str, Array]]:
-        """One step without a new episode; the rules draw no random numbers."""
+        """One step without a new episode; the rules draw no random numbers.
+
+        Infos: [N] arrays `terminated`, `truncated` and `true_moves`.
+        """
         del key
         result = env.step(self.config, state, jnp.stack([actions[a] for a in self.agents]))
         ended = result.terminated | result.truncated
@@ -164,6 +194,3 @@ class MoonGrid:
     def get_avail_actions(self, state: State) -> ByAgent:
         """[5] bool by agent: staying, and moves that the map does not turn back."""
         return self._split(env.available(state))
-
-    def _split(self, values: Array) -> ByAgent:
-        return {agent: values[i] for i, agent in enumerate(self.agents)}

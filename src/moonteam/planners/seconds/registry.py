@@ -4,8 +4,8 @@ One's own is a class, or a function, that makes an object with `plan(moment) -> 
 (`base.TimedPlanner`), offered as `--planner FILE.py:OBJECT` or by an entry point in the group
 `moonteam.planners.seconds`. It is called with what it has parameters for: `objective`
 (makespan, effort or weighted), `alpha`, `beta`, `time_limit`, `seed`, or all as `options`. A
-class may say `most_targets` of itself, the open targets that it takes on. Ours are imported
-when they are first asked for.
+class may say of itself `most_targets`, the open targets that it takes on, and `wants_policy`, that
+it decides by the policy of the options. Ours are imported when they are first asked for.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ _HERE = "moonteam.planners.seconds"
 _REGISTRY: Registry[object] = Registry("planner by the clock", _HERE, object, {
     "exact": f"{_HERE}.exact:ExactPlanner", "greedy": f"{_HERE}.greedy:GreedyPlanner",
     "lns": f"{_HERE}.local:LocalSearchPlanner", "cpsat": f"{_HERE}.cpsat:CpSatPlanner",
-    "exhaustive": f"{_HERE}.exhaustive:ExhaustivePlanner"})
+    "exhaustive": f"{_HERE}.exhaustive:ExhaustivePlanner",
+    "policy": f"{_HERE}.policy:PolicyPlanner"})
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,14 @@ class TimedPlannerKind:
     factory: Callable[..., TimedPlanner]
     most_targets: int | None = None
     """Open targets that it takes on; None: any number."""
+    wants_policy: bool = False
+    """Whether it decides by the policy of the options."""
 
     @property
     def anytime(self) -> bool:
         """Whether a time limit stops it with the best plan found so far."""
-        return bool({"time_limit", "options"} & set(self._parameters))
+        takes = set(self._parameters)
+        return "time_limit" in takes or ("options" in takes and not self.wants_policy)
 
     @property
     def _parameters(self) -> Mapping[str, inspect.Parameter]:
@@ -78,4 +82,5 @@ def find(name: str, source: object = "--planner") -> TimedPlannerKind:
                          "which is a class, or a function that makes one")
     own = name.rpartition(":")[2] if ".py:" in name else name
     factory = cast(Callable[..., TimedPlanner], thing)
-    return TimedPlannerKind(own, factory, getattr(thing, "most_targets", None))
+    return TimedPlannerKind(own, factory, getattr(thing, "most_targets", None),
+                            bool(getattr(thing, "wants_policy", False)))
