@@ -29,6 +29,18 @@ class Decode:
     watch: bool = False
     rollouts: int = 1
     temperature: float = 1.0
+    usual: bool = False
+    """Nobody asked for a temperature; it is that of a step."""
+
+    @property
+    def heat(self) -> float:
+        """Temperature at which targets are drawn; 0: never."""
+        return 0.0 if not self.sample else HELD if self.usual else self.temperature
+
+
+HELD = 1.0
+"""Temperature at which choices of targets are drawn, which are few and held; `SAMPLING` is that
+of the many steps of a stepwise policy."""
 
 
 def parse(text: str) -> Decode:
@@ -50,7 +62,7 @@ def parse(text: str) -> Decode:
     usual = SAMPLING if sample else 1.0
     heat = usual if found["heat"] is None else _temperature(text, found["heat"])
     name = how + ("" if heat == usual else f"@{heat:g}")
-    return Decode(name, sample, how == "argmax", rollouts, heat)
+    return Decode(name, sample, how == "argmax", rollouts, heat, found["heat"] is None)
 
 
 def _temperature(text: str, heat: str) -> float:

@@ -45,11 +45,11 @@ _PADDING = {"start": FAR, "between": FAR, "lapses": FAR}  # zero and False elsew
 
 @dataclass(frozen=True)
 class Rollouts:
-    """What every try did. Times in s (or the tables' unit) from the problem's time 0."""
+    """The plan that every try came to. Times in s (or the tables' unit) from its time 0."""
 
     solved: npt.NDArray[np.bool_]  # [B, K] every target within the problem's limit
-    seconds: npt.NDArray[np.float32]  # [B, K] until all are solved (and home); until it broke off
-    effort: npt.NDArray[np.float32]  # [B, K] weighted s of travel
+    seconds: npt.NDArray[np.float64]  # [B, K] until all are solved (and home); until it broke off
+    effort: npt.NDArray[np.float64]  # [B, K] weighted s of travel
     order: npt.NDArray[np.int32]  # [B, K, N, M] decision at which it set out there; -1: never
     start: npt.NDArray[np.float64]  # [B, K, M] s, of each target's service; nan: never served
     end: npt.NDArray[np.float64]  # [B, K, M] s
@@ -124,12 +124,16 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
              tick: Callable[[int], object] = lambda episodes: None) -> Rollouts:
     """Plays every problem `tries` times from its beginning to its end.
 
+    At every event those on their way may turn to another target, as robots that ask the policy
+    anew would. Of a plan it is known beforehand who serves what in which order: in the routes that
+    are returned everybody goes there at once, and times and effort are theirs.
+
     Args:
       policy: of kind pointer.
       problems: [B] NumPy arrays as from `stacked`.
       tries: K.
-      heat: temperature at which choices are drawn; 0 takes the likeliest, and then all tries are
-        the same.
+      heat: temperature at which choices are drawn, but for the first of several tries, which
+        takes the likeliest; 0: all of them do.
       seed: of the draws.
       preference: 0 time .. 1 effort.
       tick: told how many episodes have ended, now and then.
@@ -149,8 +153,7 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
             lambda x, n=real: x.reshape(play.rows, tries, *x.shape[1:])[:n], done))
         tick(real * tries)
     whole: _Done = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    start, end = _times(problems, whole)
-    return Rollouts(whole.solved, whole.seconds, whole.effort, whole.order, start, end)
+    return _routed(problems, whole)
 
 
 def warm(policy: Policy, problems: MacroProblem, tries: int = 1) -> None:
@@ -190,8 +193,6 @@ class _Done(NamedTuple):
     """What the episodes did; [F], or [E] while they are under way."""
 
     solved: Any
-    seconds: Any
-    effort: Any
     order: Any  # [., N, M] int32
     arrival: Any  # [., N, M] s at which an agent is at a target that it set out for
     served: Any  # [., M] bool
@@ -217,8 +218,7 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
 
     def blank(size: int) -> _Done:
         shape = (size, agents, targets)
-        none = jnp.zeros(size)
-        return _Done(none > 0, none, none, jnp.full(shape, -1, jnp.int32), jnp.zeros(shape),
+        return _Done(jnp.zeros(size, bool), jnp.full(shape, -1, jnp.int32), jnp.zeros(shape),
                      jnp.zeros((size, targets), bool))
 
     def fresh(episode: Array) -> MacroState:
@@ -234,15 +234,18 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
         state, log = pool.state, pool.log
         view = jax.vmap(pointer.look)(state, likings)
         logits = pointer.point(params, spec, view).logits
-        drawn = heat * jax.vmap(noise)(pool.episode, pool.turn)
+        first_try = (pool.episode % tries == 0) & (tries > 1)
+        warm = jnp.where(first_try, 0.0, heat)[:, None, None]
+        drawn = warm * jax.vmap(noise)(pool.episode, pool.turn)
         choice, _ = jax.vmap(world.choose)(state, logits, drawn)
         result = jax.vmap(world.step)(state, choice)
-        log = _written(log, state, choice, pool.turn, result.effort)
-        after = result.state
+        log = _written(log, state, choice, pool.turn)
+        after = jax.vmap(world.loosen)(result.state, jnp.ones(choice.shape, bool))
+        turned = jax.nn.one_hot(jnp.where(after.goal != result.state.goal, result.state.goal,
+                                          targets), targets, dtype=bool)
+        log = log._replace(order=jnp.where(turned, -1, log.order))
         over = (result.terminated | result.truncated) & (pool.episode < count)
-        end = state.now + result.seconds
-        solved = result.terminated & (end <= state.problem.limit + world.SOON)
-        log = log._replace(solved=solved, seconds=end, served=after.solved | after.serving)
+        log = log._replace(solved=result.terminated, served=after.solved | after.serving)
         at = jnp.where(over, pool.episode, rows * tries)
         done = jax.tree.map(lambda all_, own: all_.at[at].set(own, mode="drop"), pool.done, log)
         taken = pool.following + jnp.cumsum(over) - 1
@@ -257,21 +260,71 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
     return jax.lax.while_loop(lambda pool: jnp.any(pool.episode < count), decide, begun).done
 
 
-def _written(log: _Done, state: MacroState, choice: Array, turn: Array, effort: Array) -> _Done:
+def _written(log: _Done, state: MacroState, choice: Array, turn: Array) -> _Done:
     """The log with who set out, and when each will be there."""
     targets = log.served.shape[1]
     going = jax.nn.one_hot(choice, targets, dtype=bool) & jax.vmap(world.free)(state)[:, :, None]
     legs = jax.vmap(world.legs)(state.problem, state.node)
     order = jnp.where(going, turn[:, None, None], log.order)
     arrival = jnp.where(going, state.now[:, None, None] + legs, log.arrival)
-    return log._replace(order=order, arrival=arrival, effort=log.effort + effort)
+    return log._replace(order=order, arrival=arrival)
 
 
-def _times(problems: MacroProblem, done: _Done) -> tuple[Any, Any]:
-    """[B, K, M] start and end of every service: when all are there and what is before has ended.
+def _routed(problems: MacroProblem, done: _Done) -> Rollouts:
+    """Everybody straight to what it came to serve, in the order in which that began."""
+    played = _times(problems, done)  # [B, K, M]
+    depth = _depth(np.asarray(problems.after))[:, None].astype(np.float64)
+    turn = np.where(done.order >= 0, done.order, -1).max(2)
+    sequence = np.lexsort((turn, np.broadcast_to(depth, played.shape), played), axis=-1)
+    own = np.swapaxes(done.order >= 0, -1, -2) & np.isfinite(played)[..., None]  # [B, K, M, N]
+    agents, targets = problems.start.shape[1:]
+    row = np.arange(len(played))[:, None, None]
+    each = np.arange(agents)[None, None]
+    clock = np.broadcast_to(problems.free[:, None].astype(np.float64), (*own.shape[:2], agents))
+    clock, last = clock.copy(), np.full(clock.shape, targets)
+    start, end = np.full(played.shape, np.nan), np.full(played.shape, np.nan)
+    effort, fits = np.zeros(clock.shape), np.ones(played.shape[:2], bool)
+    for place in range(targets):
+        j = sequence[..., place, None]  # [B, K, 1]
+        team = np.take_along_axis(own, j[..., None], axis=2)[:, :, 0]  # [B, K, N]
+        served = team.any(-1)
+        leg = np.where(last == targets, problems.start[row, each, j],
+                       problems.between[row, each, np.minimum(last, targets - 1), j])
+        begin = np.where(team, clock + leg, 0.0).max(-1)
+        begin = np.maximum(begin, problems.appears[row[..., 0], j[..., 0]])
+        waits = problems.after[row[..., 0], j[..., 0]]  # [B, K, M]
+        begin = np.maximum(begin, np.where(waits & np.isfinite(end), end, 0.0).max(-1))
+        fits &= ~served | (begin <= problems.lapses[row[..., 0], j[..., 0]] + world.SOON)
+        finish = begin + problems.service[row[..., 0], j[..., 0]]
+        effort += np.where(team, leg, 0.0)
+        clock, last = np.where(team, finish[..., None], clock), np.where(team, j, last)
+        for times, value in ((start, begin), (end, finish)):
+            np.put_along_axis(times, j, np.where(served, value, np.nan)[..., None], axis=-1)
+    home = np.where(last == targets, problems.home_now[:, None],
+                    problems.home[row, each, np.minimum(last, targets - 1)])
+    home = np.where(problems.agent_mask[:, None], home, 0.0)
+    there = np.where(problems.agent_mask[:, None], clock + home, 0.0).max(-1)
+    seconds = np.maximum(there, np.nanmax(np.where(np.isfinite(end), end, 0.0), axis=-1))
+    cost = ((effort + home) * problems.effort[:, None]).sum(-1)
+    solved = done.solved & fits & (seconds <= problems.limit[:, None] + world.SOON)
+    return Rollouts(solved, seconds, cost, done.order, start, end)
 
-    As the world's rules say; made anew from the arrivals, for several services may start and
-    end between two decisions.
+
+def _depth(after: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """[B, M] how many targets one behind the other come before each."""
+    depth = np.zeros(after.shape[:2], np.int64)
+    for _ in range(after.shape[1]):
+        deeper = np.where(after, depth[:, None] + 1, 0).max(-1, initial=0)
+        if (deeper <= depth).all():
+            break
+        depth = np.maximum(depth, deeper)
+    return depth
+
+
+def _times(problems: MacroProblem, done: _Done) -> npt.NDArray[np.float64]:
+    """[B, K, M] when each service began as it was played, nan where it never did.
+
+    Made anew from the arrivals, for several services may start and end between two decisions.
     """
     there = np.where(done.order >= 0, done.arrival, 0.0).astype(np.float64).max(2)
     start = np.maximum(there, problems.appears[:, None])
@@ -283,5 +336,4 @@ def _times(problems: MacroProblem, done: _Done) -> tuple[Any, Any]:
             break
         start = np.maximum(start, later)
     served = done.served & problems.target_mask[:, None]
-    start = np.where(served, start, np.nan)
-    return start, start + service
+    return np.where(served, start, np.nan)

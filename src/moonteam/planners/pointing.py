@@ -79,7 +79,7 @@ class PointingPlanner(RoutePlanner):
     @property
     def heat(self) -> float:
         """At which choices are drawn; 0: never."""
-        return self.decode.temperature if self.decode.sample else 0.0
+        return self.decode.heat
 
     def check(self, snapshot: Snapshot) -> None:
         """Raises InputError if the policy cannot serve this mission."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from moonteam.errors import InputError
 from moonteam.grid.macro.draw import Draw
@@ -84,12 +84,11 @@ class MacroConfig:
 
 
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())
-SECONDS = Practice("3 unlike robots, 5 to 7 targets, straight",
-                   Draw(metric="straight", speeds=(1.5, 0.36, 0.47), limit=1200.0))
+HYPER = Hyper(loose=0.2)
 
 PRESETS = {
-    "quick": MacroConfig("quick", (PAPER,), rounds=140),
-    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=900),
+    "quick": MacroConfig("quick", (PAPER,), rounds=180, hyper=HYPER),
+    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=1050, hyper=HYPER),
     "any_team": MacroConfig(
         "any_team", (
             PAPER,
@@ -111,7 +110,7 @@ PRESETS = {
             Practice("6 to 8 robots, 24 to 40 targets",
                      Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
                           limit=8000.0), shrink=16),
-        ), rounds=900, hyper=Hyper(spread=True)),
+        ), rounds=320, hyper=replace(HYPER, spread=True), chunk_rounds=2, eval_every=5),
 }
 
 

@@ -55,6 +55,8 @@ class Hyper:
     """Weight that time and way both keep at either end of the preference."""
     spread: bool = False
     """Preferences drawn from time to effort; else always time."""
+    loose: float = 0.0
+    """Share of the moments at which those on their way choose again."""
     ema: float = 0.998
     """Decay of the running mean of the weights, which is what is kept."""
 
@@ -166,6 +168,10 @@ def collect(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem 
         # Fresh episodes come from a pool, each environment's from another place at each step.
         new = jax.tree.map(lambda x: jnp.roll(x, t, axis=0), pool)
         after = trees.where(ended, new, Walk(result.state, walk.preference))
+        if hyper.loose:
+            again = jax.random.bernoulli(jax.random.fold_in(key, 1), hyper.loose, ended.shape)
+            everyone = jnp.broadcast_to(again[:, None], choice.shape)
+            after = after._replace(states=jax.vmap(world.loosen)(after.states, everyone))
         row = Rows(view, choice, options, log_prob, said.value, reward, ended, result.truncated)
         return after, (row, jnp.where(ended, walk.states.now + result.seconds, 0.0))
 

@@ -52,6 +52,8 @@ class MacroState:
     problem: MacroProblem
     now: Array  # [] s
     node: Array  # [N] int32, the target where it is or will be when next free; M: its start
+    origin: Array  # [N] int32, where its last way began: a target, or M: its start
+    leg: Array  # [N] s, of its last way
     goal: Array  # [N] int32, the target it is bound to; M: none
     busy: Array  # [N] s until it arrives at its goal, its service ends, or it can first set out
     serving: Array  # [M] bool

@@ -29,7 +29,8 @@ def reset(problem: MacroProblem) -> MacroState:
     agents, targets = problem.start.shape
     none = jnp.full(agents, targets, jnp.int32)
     start = MacroState(
-        problem, jnp.zeros(()), none, none, problem.free, jnp.zeros(targets, bool),
+        problem, jnp.zeros(()), none, none, jnp.zeros(agents), none, problem.free,
+        jnp.zeros(targets, bool),
         ~problem.target_mask, problem.free, jnp.zeros(agents))
     return _run(start, jnp.any(free(start)))[0]
 
@@ -149,6 +150,7 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     leg = jnp.where(going, leg, 0.0)
     out = replace(
         state, goal=jnp.where(going, choice, state.goal), node=jnp.where(going, choice, state.node),
+        origin=jnp.where(going, state.node, state.origin), leg=jnp.where(going, leg, state.leg),
         busy=jnp.where(going, leg, state.busy), travelled=state.travelled + leg)
     after, dead = _run(out, jnp.array(False))
     done = jnp.all(after.solved)
@@ -158,6 +160,35 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     end = jnp.where(done, end, after.now)
     effort = jnp.sum(problem.effort * (leg + jnp.where(done, way, 0.0)))
     return MacroResult(after, end - state.now, effort, done, ~done & dead)
+
+
+def loosen(state: MacroState, who: Array) -> MacroState:
+    """The state in which those of `who` [N] bool that are on their way may choose again.
+
+    Where an agent is, p seconds from a and r from b, it is as far from c as Stewart's theorem says
+    of a point of the way from a to b: exact on straight ways, on others kept within what the
+    triangle allows. It stands in `problem.start`, for from now on the agent starts there.
+    """
+    problem = state.problem
+    targets = problem.start.shape[1]
+    here = jnp.minimum(state.goal, targets - 1)
+    who = who & problem.agent_mask & (state.goal < targets) & (state.busy > 0)
+    who = who & ~state.serving[here]
+    rest = jnp.minimum(state.busy, state.leg)[:, None]
+    gone = (state.leg[:, None] - rest)
+    near, far = legs(problem, state.origin), legs(problem, state.node)  # [N, M] from a, from b
+    square = (rest * near**2 + gone * far**2) / jnp.maximum(state.leg, SOON)[:, None] - gone * rest
+    low = jnp.maximum(jnp.abs(near - gone), jnp.abs(far - rest))
+    high = jnp.minimum(near + gone, far + rest)
+    start = jnp.clip(jnp.sqrt(jnp.maximum(square, 0.0)), jnp.minimum(low, high), high)
+    start = jnp.where((near >= FAR) | (far >= FAR), jnp.where(high >= FAR, FAR, high), start)
+    own = jax.nn.one_hot(state.goal, targets, dtype=bool)
+    start = jnp.where(own, rest, start)
+    out = replace(problem, start=jnp.where(who[:, None], start, problem.start))
+    travelled = state.travelled - jnp.where(who, rest[:, 0], 0.0)
+    return replace(
+        state, problem=out, travelled=travelled, node=jnp.where(who, targets, state.node),
+        goal=jnp.where(who, targets, state.goal), busy=jnp.where(who, 0.0, state.busy))
 
 
 def _way_home(state: MacroState) -> Array:

@@ -52,7 +52,7 @@ class PolicyPlanner:
         self.policy: Policy = options.loaded()
         macro.spec_of(self.policy)
         self.tries, self.seed = decoding.rollouts, options.seed
-        self.heat = decoding.temperature if decoding.sample else 0.0
+        self.heat = decoding.heat
         self.preference = options.preference
         word, *_ = meaning(options)
         self.objective: Objective = "effort" if word == "moves" else word
