@@ -1,5 +1,6 @@
 """Rollouts in the macro world: against one played by hand, padded, drawn, with services."""
 
+import itertools
 from dataclasses import replace
 from functools import partial
 
@@ -14,6 +15,7 @@ from moonteam.grid.macro import world
 from moonteam.grid.macro.types import FAR
 from moonteam.planners import macro
 from moonteam.planners.base import Snapshot
+from moonteam.planners.plans.routes import meeting_times
 from moonteam.planners.pointing import problem_of
 from moonteam.planners.search.task import Task
 from moonteam.planners.search.travel import travel_times
@@ -26,10 +28,14 @@ def policy(pointing):
     return Policy.load(pointing)
 
 
-def problem(seed=0, agents=3, targets=4):
-    moment = Snapshot.start(scenarios.generate(
+def moment(seed=0, agents=3, targets=4):
+    return Snapshot.start(scenarios.generate(
         seed, num_agents=agents, num_targets=targets, size=(9, 9), max_steps=90))
-    return problem_of(Task.of(moment, travel_times(moment)))
+
+
+def problem(seed=0, agents=3, targets=4):
+    now = moment(seed, agents, targets)
+    return problem_of(Task.of(now, travel_times(now)))
 
 
 @pytest.fixture(scope="module")
@@ -40,34 +46,55 @@ def many():
 @partial(jax.jit, static_argnames="spec")
 def _decide(spec, params, state):
     logits = pointer.point(params, spec, pointer.look(state, jnp.zeros(()))).logits
-    choice, options = world.choose(state, logits, jnp.zeros_like(logits))
-    return choice, options, world.step(state, choice)
+    choice, _ = world.choose(state, logits, jnp.zeros_like(logits))
+    result = world.step(state, choice)
+    return choice, result, world.loosen(result.state, jnp.ones(choice.shape, bool))
 
 
 def by_hand(policy, one):
-    """(seconds, effort, order [N, M]) of the likeliest choices, decision by decision."""
+    """(seconds, order [N, M]) of the likeliest choices, decision by decision, as they are played.
+
+    Those on their way choose again at every event; who turned away did not set out there.
+    """
     state = jax.jit(world.reset)(jax.tree.map(jnp.asarray, one))
     agents, targets = one.start.shape
-    order, effort, now = np.full((agents, targets), -1), 0.0, 0.0
+    order = np.full((agents, targets), -1)
     for turn in range(50):
         free = np.asarray(jax.jit(world.free)(state))
-        choice, _, result = _decide(policy.brain.spec, policy.params, state)
+        choice, result, after = _decide(policy.brain.spec, policy.params, state)
         for a in np.flatnonzero(free & (np.asarray(choice) < targets)):
             order[a, choice[a]] = turn
-        effort += float(result.effort)
-        now, state = float(state.now + result.seconds), result.state
+        for a in np.flatnonzero(np.asarray(after.goal != result.state.goal)):
+            order[a, result.state.goal[a]] = -1
         if result.terminated:
-            return now, effort, order
+            return float(state.now + result.seconds), order
+        state = after
     raise AssertionError("it never ends")
 
 
 def test_rollouts_are_those_of_the_world_decision_by_decision(policy, many):
+    """Who serves what is as it was played; when, as of robots that knew it from the start."""
     found = macro.rollouts(policy, many)
     for b in range(5):
-        seconds, effort, order = by_hand(policy, jax.tree.map(lambda x, b=b: x[b], many))
+        seconds, order = by_hand(policy, jax.tree.map(lambda x, b=b: x[b], many))
         assert found.solved[b, 0]
-        assert (found.seconds[b, 0], found.effort[b, 0]) == (seconds, effort)
         assert found.order[b, 0].tolist() == order.tolist()
+        travel = travel_times(moment(b))
+        routes = [[t for t in route if t >= 0] for route in found.routes(b).tolist()]
+        meets = meeting_times(travel, routes)
+        assert found.start[b, 0].tolist() == [meets[t] for t in range(4)]
+        assert found.seconds[b, 0] == max(meets.values()) <= seconds + 1e-3
+        assert found.effort[b, 0] == sum(_way(travel, a, r) for a, r in enumerate(routes))
+
+
+def _way(travel, agent, route):
+    legs = [travel.between[travel.kinds[agent], x, y] for x, y in itertools.pairwise(route)]
+    return sum(legs) + (travel.start[agent, route[0]] if route else 0)
+
+
+def test_the_first_of_several_tries_is_the_likeliest(policy, many):
+    drawn = macro.rollouts(policy, many, tries=4, heat=3.0, seed=2)
+    assert drawn.order[:, 0].tolist() == macro.rollouts(policy, many).order[:, 0].tolist()
 
 
 def test_all_serve_who_set_out_and_the_last_service_ends_the_episode(policy, many):

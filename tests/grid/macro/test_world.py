@@ -47,8 +47,8 @@ def logits_of(key, agents, targets, eager):
     return 3 * jax.random.normal(key, (agents, targets + 1)).at[:, -1].add(eager)
 
 
-@jax.jit
-def played(problems, key, heat, eager):
+@partial(jax.jit, static_argnames="turning")
+def played(problems, key, heat, eager, turning=False):
     """Episodes of random wishes to their end: the last states, decisions, what each step said."""
     agents, targets = problems.start.shape[1:]
 
@@ -59,9 +59,11 @@ def played(problems, key, heat, eager):
         noise = heat * jax.random.gumbel(key, logits.shape)
         choice, options = jax.vmap(world.choose)(states, logits, noise)
         result = jax.vmap(world.step)(states, choice)
+        after = result.state
+        if turning:
+            after = jax.vmap(world.loosen)(after, jnp.ones(choice.shape, bool))
         kept = jax.tree.map(
-            lambda a, b: jnp.where(over.reshape(-1, *[1] * (a.ndim - 1)), a, b),
-            states, result.state)
+            lambda a, b: jnp.where(over.reshape(-1, *[1] * (a.ndim - 1)), a, b), states, after)
         picked = jnp.take_along_axis(options, choice[..., None], axis=2)[..., 0]
         ended = result.terminated | result.truncated
         said = (jnp.where(over[:, None], True, picked), ~over & result.truncated,
@@ -74,22 +76,46 @@ def played(problems, key, heat, eager):
     return states, count, said
 
 
-@pytest.mark.parametrize(("heat", "eager"), [(0.0, 0.0), (1.0, 0.0), (0.0, 4.0), (1.0, -9.0)])
-def test_every_episode_ends_with_all_solved(heat, eager):
+@pytest.mark.parametrize(("heat", "eager", "turning"), [
+    (0.0, 0.0, False), (1.0, 0.0, False), (0.0, 4.0, False), (1.0, -9.0, False),
+    (1.0, 0.0, True), (1.0, -9.0, True)])
+def test_every_episode_ends_with_all_solved(heat, eager, turning):
+    """Also where those on their way choose again, and may turn away, at every event."""
     for seed in range(3):
         problems = draws(PLAIN, jax.random.key(seed))
         problems = richer(problems, seed) if seed else problems
         states, count, (picked, truncated, seconds, effort) = jax.tree.map(
-            np.asarray, played(problems, jax.random.key(seed), heat, eager))
+            np.asarray, played(problems, jax.random.key(seed), heat, eager, turning))
         assert picked.all(), "chose what was not to be chosen"
         assert not truncated.any()
         assert states.solved.all()
         assert count.max() <= MOST
         assert (seconds >= 0).all()
         assert (effort >= 0).all()
-        if not seed:
+        if not seed and not turning:
             np.testing.assert_allclose(seconds.sum(0), states.now, rtol=1e-5)
             np.testing.assert_allclose(effort.sum(0), states.travelled.sum(1), rtol=1e-5)
+
+
+def test_who_turns_away_starts_where_it_is():
+    """On straight ways the times after `loosen` are those from the point that was reached."""
+    r = np.random.default_rng(0)
+    for _ in range(5):
+        start, spots = r.uniform(0, 20, (2, 2)), r.uniform(0, 20, (4, 2))
+        apart = lambda a, b: np.linalg.norm(a[:, None] - b[None], axis=-1)
+        problem = team([[1, 0], [1, 0]], [[1, 0]] * 4, apart(start, spots), apart(spots, spots))
+        state = step(reset(problem), jnp.array([0, 1])).state
+        late = int(np.argmax(np.asarray(state.busy)))
+        assert state.goal[late] == late
+        gone = float(state.now) / np.linalg.norm(spots[late] - start[late])
+        point = start[late] + gone * (spots[late] - start[late])
+        after = world.loosen(state, jnp.ones(2, bool))
+        assert (after.goal[late], after.node[late], after.busy[late]) == (4, 4, 0.0)
+        np.testing.assert_allclose(after.problem.start[late], apart(point[None], spots)[0],
+                                   atol=2e-3)
+        np.testing.assert_allclose(after.travelled[late], state.now, rtol=1e-5)
+        same = world.loosen(state, jnp.zeros(2, bool))
+        jax.tree.map(np.testing.assert_array_equal, same, state)
 
 
 def team(has, need, start, between, **changes):

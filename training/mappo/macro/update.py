@@ -160,18 +160,21 @@ def collect(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem 
         result = jax.vmap(world.step)(walk.states, choice)
         by_time = 1.0 - walk.preference + hyper.tie
         by_way = walk.preference + hyper.tie
-        unit = walk.states.problem.unit
         open_ = jnp.sum(~result.state.solved, axis=-1)
-        reward = -(by_time * result.seconds + by_way * result.effort) / unit
+        states, effort = result.state, result.effort
+        if hyper.loose:
+            again = jax.random.bernoulli(jax.random.fold_in(key, 1), hyper.loose, open_.shape)
+            everyone = jnp.broadcast_to(again[:, None], choice.shape)
+            states = jax.vmap(world.loosen)(states, everyone)
+            # What is left of a way is not yet gone: whoever sets out again pays for it then.
+            unspent = (result.state.travelled - states.travelled) * states.problem.effort
+            effort = effort - jnp.where(result.terminated, 0.0, jnp.sum(unspent, axis=-1))
+        reward = -(by_time * result.seconds + by_way * effort) / walk.states.problem.unit
         reward = reward - hyper.failure * jnp.where(result.truncated, open_, 0)
         ended = result.terminated | result.truncated
         # Fresh episodes come from a pool, each environment's from another place at each step.
         new = jax.tree.map(lambda x: jnp.roll(x, t, axis=0), pool)
-        after = trees.where(ended, new, Walk(result.state, walk.preference))
-        if hyper.loose:
-            again = jax.random.bernoulli(jax.random.fold_in(key, 1), hyper.loose, ended.shape)
-            everyone = jnp.broadcast_to(again[:, None], choice.shape)
-            after = after._replace(states=jax.vmap(world.loosen)(after.states, everyone))
+        after = trees.where(ended, new, Walk(states, walk.preference))
         row = Rows(view, choice, options, log_prob, said.value, reward, ended, result.truncated)
         return after, (row, jnp.where(ended, walk.states.now + result.seconds, 0.0))
 

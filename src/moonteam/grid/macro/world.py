@@ -173,7 +173,10 @@ def loosen(state: MacroState, who: Array) -> MacroState:
     targets = problem.start.shape[1]
     here = jnp.minimum(state.goal, targets - 1)
     who = who & problem.agent_mask & (state.goal < targets) & (state.busy > 0)
-    who = who & ~state.serving[here]
+    # Nobody turns away from a target that others, bound already, wait for.
+    bound = jnp.any(jax.nn.one_hot(state.goal, targets, dtype=bool), axis=0)
+    due = jnp.any(problem.after & bound[:, None], axis=0)
+    who = who & ~state.serving[here] & ~due[here]
     rest = jnp.minimum(state.busy, state.leg)[:, None]
     gone = (state.leg[:, None] - rest)
     near, far = legs(problem, state.origin), legs(problem, state.node)  # [N, M] from a, from b

@@ -66,6 +66,25 @@ def test_returns_are_what_an_episode_costs():
         assert float(reward[:first + 1, e].sum()) == pytest.approx(-float(price), rel=1e-5)
 
 
+def test_who_chooses_again_does_not_pay_twice():
+    """Turning included, the way paid for is the way that was gone."""
+    hyper = dataclasses.replace(HYPER, num_steps=14, loose=1.0, tie=0.0, spread=True)
+    learner = MacroMappo(TINY).learner
+    walk = fresh(SMALL, hyper, None, jax.random.key(4), 16)
+    walk = walk._replace(preference=jnp.ones(16))  # all is effort
+    _, rows, _, _ = collect(SPEC, SMALL, hyper, None, learner.params, walk, jax.random.key(5))
+    ended, reward = np.asarray(rows.ended), np.asarray(rows.reward)
+    for e in range(16):
+        first = int(np.argmax(ended[:, e]))
+        state = world.reset(jax.tree.map(lambda x, e=e: x[e], walk.states.problem))
+        for t in range(first + 1):
+            result = world.step(state, rows.choice[t, e])
+            state = world.loosen(result.state, jnp.ones(2, bool))
+        assert bool(result.terminated)
+        price = float(result.state.travelled.sum() / state.problem.unit)
+        assert float(reward[:first + 1, e].sum()) == pytest.approx(-price, rel=1e-4, abs=1e-5)
+
+
 def test_the_first_gradient_sees_ratios_of_one():
     learner, _, (_, rows, _, _) = rows_of()
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
