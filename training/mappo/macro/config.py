@@ -65,17 +65,24 @@ class MacroConfig:
                                  "least 1", f"hyper.{key}")
         if not 0.0 < self.lr <= 0.1:
             raise InputError(self.macro, f"{self.lr:g} is not allowed; above 0, at most 0.1", "lr")
+        if not 0.0 < self.hyper.learned <= 1.0:
+            raise InputError(self.macro, f"{self.hyper.learned:g} is not allowed; above 0, at most "
+                             "1", "hyper.learned")
         for one in self.families:
-            decisions = self.envs(one) * self.hyper.num_steps
-            if self.envs(one) < 1 or decisions % self.hyper.minibatches:
+            rows = self.rows(one)
+            if self.envs(one) < 1 or rows < 1 or rows % self.hyper.minibatches:
                 raise InputError(
-                    self.macro, f"{self.hyper.minibatches} minibatches do not divide "
-                    f"{self.envs(one)} environments x {self.hyper.num_steps} decisions of "
-                    f"{one.name}", "hyper.minibatches")
+                    self.macro, f"{self.hyper.minibatches} minibatches do not divide the {rows} "
+                    f"moments learned from of {self.envs(one)} environments x "
+                    f"{self.hyper.num_steps} decisions of {one.name}", "hyper.minibatches")
 
     def envs(self, family: Practice) -> int:
         """Environments of a family."""
         return self.num_envs // family.shrink
+
+    def rows(self, family: Practice) -> int:
+        """Moments of a family that a pass learns from."""
+        return int(self.envs(family) * self.hyper.num_steps * self.hyper.learned)
 
     @property
     def decisions(self) -> int:

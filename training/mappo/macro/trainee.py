@@ -43,8 +43,7 @@ class MacroMappo:
         self.config, self.name, self.seed, self.source = config, config.macro, config.seed, source
         parts = config.hyper.minibatches
         self.mesh = mesh_for([config.envs(f) for f in config.families]
-                             + [config.envs(f) * config.hyper.num_steps // parts
-                                for f in config.families])
+                             + [config.rows(f) // parts for f in config.families])
         key = jax.random.key(config.seed)
         keys = jax.random.split(key, len(config.families) + 1)
         params = pointer.init(config.spec, keys[0]) if params is None else params

@@ -39,7 +39,10 @@ class Hyper:
     """T, decisions of each environment between updates."""
     epochs: int = 1
     """Passes over what was collected."""
-    minibatches: int = 16
+    learned: float = 0.625
+    """Share of the moments that are learned from; those at which somebody had a choice first, which
+    are about as many."""
+    minibatches: int = 10
     """Parts of a pass."""
     gae_lambda: float = 0.95
     """Of generalised advantage estimation; the discount is 1."""
@@ -242,10 +245,16 @@ def update(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem |
         mean = jax.tree.map(lambda m, p: keep * m + (1.0 - keep) * p, learner.mean, params)
         return Learner(params, mean, state, learner.steps + 1), said
 
-    order = jax.vmap(lambda k: jax.random.permutation(k, gain.size))(
-        jax.random.split(order_key, hyper.epochs))
+    forced = jnp.all(jnp.sum(flat.options, axis=-1) == 1, axis=-1)
+
+    def order(key: Array) -> Array:
+        """Random, with the moments at which nobody had a choice last."""
+        late = jax.random.uniform(key, forced.shape) + forced
+        return jnp.argsort(late)[:int(forced.size * hyper.learned)]
+
+    rows_in_order = jax.vmap(order)(jax.random.split(order_key, hyper.epochs))
     learner, said = jax.lax.scan(improve, learner,
-                                 order.reshape(hyper.epochs * hyper.minibatches, -1))
+                                 rows_in_order.reshape(hyper.epochs * hyper.minibatches, -1))
     episodes, solved, length = jax.lax.psum(
         (jnp.sum(rows.ended), jnp.sum(rows.ended & ~rows.truncated), jnp.sum(lengths)), AXIS)
     count = jnp.maximum(episodes, 1)

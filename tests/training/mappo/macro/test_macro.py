@@ -28,7 +28,7 @@ from training.run.trainee import Position
 
 SPEC = PointerSpec(width=16, heads=2, layers=1, pairs=8)
 SMALL = Draw(agents=(2, 2), targets=(2, 2), sides=(6, 6), limit=60.0)
-HYPER = Hyper(num_steps=4, minibatches=2)
+HYPER = Hyper(num_steps=4, learned=0.5, minibatches=2)
 TINY = MacroConfig("quick", (Practice("small", SMALL),), rounds=3, num_envs=8, hyper=HYPER,
                    spec=SPEC, chunk_rounds=1, eval_every=1, eval_scenarios=32)
 BOTH = dataclasses.replace(
