@@ -30,12 +30,15 @@ class Args(Watched):
     Examples:
       moonteam train quick
       moonteam train paper_team --seed 1 --out runs/team-1
+      moonteam train paper_team --seeds 0 1 2 --out runs/team
       moonteam train any_team --out runs/any --resume
       moonteam train any_team --policy any_team --lr 3e-4 --rounds 300 --out runs/further
     """
 
     config: Annotated[MacroConfig, tyro.conf.arg(name="")]
     """The run's numbers, from the preset."""
+    seeds: tuple[int, ...] = ()
+    """Several runs one after the other, each in OUT/SEED, then put side by side in OUT."""
     policy: str = ""
     """Policy file (.safetensors) or the name of a bundled policy, of kind pointer, to go on from
     instead of fresh weights."""
@@ -49,6 +52,23 @@ def parse(words: list[str]) -> Args:
 
 def run(args: Args) -> int:
     """Trains; returns the exit code."""
+    if not args.seeds:
+        return _train(args)
+    if len(set(args.seeds)) < len(args.seeds):
+        raise InputError("--seeds", f"{' '.join(map(str, args.seeds))}: a seed is given twice")
+    base = args.out or args.folder(args.config.macro, args.seeds[0]).parent / args.config.macro
+    for seed in args.seeds:
+        out = base / str(seed)
+        one = dataclasses.replace(args, seeds=(), out=out, resume=args.resume and out.exists(),
+                                  config=dataclasses.replace(args.config, seed=seed))
+        if code := _train(one):
+            return code
+    from training.commands import compare
+
+    return compare.run(compare.Args(tuple(base / str(seed) for seed in args.seeds), out=base))
+
+
+def _train(args: Args) -> int:
     from training.mappo.macro.trainee import MacroMappo
 
     use_all_cores()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from moonteam.errors import InputError
 from moonteam.grid.macro.draw import Draw
@@ -44,6 +45,8 @@ class MacroConfig:
     """Learning rate at the start; falls linearly to a twentieth."""
     ent_coef: float = 0.01
     """Entropy bonus at the start; falls linearly to 0 at five sixths of the run."""
+    precision: Literal["float32", "tf32", "bfloat16"] = "float32"
+    """Of matrix products; parameters and losses are float32 in all three."""
     seed: int = 0
     """Seed of everything random in training."""
     chunk_rounds: int = 5

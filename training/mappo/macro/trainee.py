@@ -24,6 +24,8 @@ from training.run.trainee import Made, Position, Row
 from training.sharding import everywhere, gather, mesh_for, spread
 
 PHASE = "macro"
+PRECISION = {"float32": "float32", "tf32": "tensorfloat32", "bfloat16": "bfloat16"}
+"""Of matrix products, as JAX calls them; where a device cannot, it takes a better one."""
 
 
 class Held(NamedTuple):
@@ -96,9 +98,10 @@ class MacroMappo:
                 keys = jnp.stack([jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
                                                      int(r) * len(config.families) + i)
                                   for r in rounds])
-                self.learner, self.walks[i], report = several(
-                    self.mesh, config.spec, family.draw, config.hyper, self.grounds[i],
-                    self.learner, self.walks[i], keys, lr, entropy)
+                with jax.default_matmul_precision(PRECISION[config.precision]):
+                    self.learner, self.walks[i], report = several(
+                        self.mesh, config.spec, family.draw, config.hyper, self.grounds[i],
+                        self.learner, self.walks[i], keys, lr, entropy)
                 reports.append(report)
         return Made(count, count * config.decisions, _summary(gather(reports)))
 

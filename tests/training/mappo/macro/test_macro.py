@@ -191,6 +191,19 @@ def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch, capsys):
     assert Policy.load(whole / "policy.safetensors").source.kind == "pointer"
 
 
+def test_several_seeds_in_one_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, "quick", dataclasses.replace(TINY, rounds=1))
+    assert main(["train", "quick", "--seeds", "3", "4", "--out", str(tmp_path)]) == 0
+    assert "quick" in capsys.readouterr().out
+    document = json.loads((tmp_path / "compare.json").read_text())
+    assert document["summary"][0]["seeds"] == 2
+    assert (tmp_path / "curves.png").stat().st_size > 0
+    first, second = (load_policy(tmp_path / seed / "policy.safetensors").params for seed in "34")
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second),
+                                              strict=True))
+    assert main(["train", "quick", "--seeds", "3", "3", "--out", str(tmp_path / "x")]) == 2
+
+
 def test_impossible_numbers(tmp_path, capsys):
     with pytest.raises(InputError, match="do not divide"):
         dataclasses.replace(TINY, num_envs=7, hyper=dataclasses.replace(HYPER, minibatches=8))
