@@ -30,14 +30,15 @@ def make(family: Draw, count: int, seed: int) -> MacroProblem:
     """
     rng = np.random.default_rng(seed)
     made = []
-    for _ in range(count):
+    for number in range(count):
         some = float(rng.uniform(0.02, 0.2))
         more = some + float(rng.uniform(0.02, 0.15))
         side = int(rng.integers(family.sides[0], family.sides[1] + 1))
         blocked: dict[str, float] = dict(zip(KINDS, (0.0, some, more), strict=True))
+        few, most = family.targets  # the first has the most: all are padded to its shape
         drawn = scenarios.generate(
-            rng, num_agents=family.agents[1], num_targets=int(rng.integers(
-                family.targets[0], family.targets[1] + 1)),
+            rng, num_agents=family.agents[1],
+            num_targets=int(rng.integers(few, most + 1)) if number else most,
             num_skills=family.num_skills, size=(side, side), max_steps=1024, blocked=blocked,
             kinds=[KINDS[i % 3] for i in range(family.agents[1])])
         made.append(scenarios.to_problem(drawn))
