@@ -67,10 +67,10 @@ def test_the_file_takes_any_team_and_any_skills(path):
     session = onnxruntime.InferenceSession(model_of(policy))
     assert {one.name for one in session.get_inputs()} == {
         field.name for field in dataclasses.fields(Outlook)}
-    rng = np.random.default_rng(1)
+    rng, point = np.random.default_rng(1), jax.jit(pointer.point, static_argnums=1)
     for batch, agents, targets, skills in ((1, 1, 1, 1), (3, 4, 7, 5), (2, 9, 20, 8)):
         view = outlook(rng, batch, agents, targets, skills)
-        known = pointer.point(policy.params, SPEC, Outlook(**view)).logits
+        known = point(policy.params, SPEC, Outlook(**view)).logits
         said = session.run(["logits"], view)[0]
         np.testing.assert_allclose(said, known, atol=1e-4, rtol=1e-5)
 

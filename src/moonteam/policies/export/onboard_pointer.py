@@ -41,7 +41,7 @@ class Moment:
     """What a robot knows of a mission at one moment; made by `moment`."""
 
     ways: Floats  # [N, M] s from where each robot is, or will be when free, to each target
-    start: Floats  # [N, M] s the same, from where it began; FAR: it cannot get there at all
+    start: Floats  # [N, M] s the same, from where it began, or last turned; FAR: no way at all
     between: Floats  # [N, M, M] s from target to target, by each robot
     home: Floats  # [N, M] s from each target to the robot's home; 0 where it has none
     has: Bools  # [N, S]
@@ -86,7 +86,7 @@ def moment(ways: Any, between: Any, has: Any, need: Any, *, goal: Any = None, bu
       lapses: [M] s after which it does not start.
       home: [N, M] s from each target to the robot's home.
       team: [N] bool, False for a lost robot.
-      start: [N, M] s from where each robot began; as `ways` if not given.
+      start: [N, M] s from where each robot began, or last turned; as `ways` if not given.
       unit: s, `unit_of` at the mission's beginning; of this moment if not given.
       preference: 0 time .. 1 effort.
     """
@@ -230,9 +230,9 @@ def allowed(now: Moment, goal: Ints) -> Bools:
     before are sure to be served. So no two robots wait for each other for ever.
     """
     lacking = missing(now, goal)
-    complete: Bools = ~np.any(lacking > 0, axis=1)
+    incomplete: Bools = np.any(lacking > 0, axis=1)
     here = np.minimum(goal, len(now.need) - 1)
-    loose = now.team & ~((goal < len(now.need)) & ~complete[here])
+    loose = now.team & ~((goal < len(now.need)) & incomplete[here])
     has = now.has.astype(np.int32)
     able = ((now.start < FAR) & loose[:, None]).astype(np.int32)  # [N, M]
     helps = ((lacking[None] > 0) & now.has[:, None]).any(2)
@@ -240,7 +240,7 @@ def allowed(now: Moment, goal: Ints) -> Bools:
     left = np.where(now.either[None, :, None], 0, left)
     others = (able.T @ has)[None] - able[:, :, None] * has[:, None]
     whole = (others >= left).all(2)
-    sure = now.solved | now.serving | complete
+    sure = now.solved | now.serving | ~incomplete
     before = (~now.after | sure).all(1)
     in_time = now.ways <= np.minimum(now.lapses, FAR / 2)[None] + SOON
     return (_open(now) & before)[None] & helps & whole & in_time & _free(now)[:, None]
@@ -282,7 +282,8 @@ def may_turn(now: Moment) -> Bools:
     Nobody who serves, nor from a target that others, bound already, wait for.
     """
     aim, bound, here = _aims(now)
-    due = (now.after & aim.any(0)[:, None]).any(0)
+    someone: Bools = np.any(aim, axis=0)
+    due: Bools = np.any(now.after & someone[:, None], axis=0)
     return now.team & bound & (now.busy > 0) & ~now.serving[here] & ~due[here]
 
 
