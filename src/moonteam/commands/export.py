@@ -24,8 +24,11 @@ class Args(Seeded, Printed):
     """Write a policy as a self-contained ONNX file and hold it against the original.
 
     The file takes any number of robots and targets where the policy does; its metadata say
-    what the inputs are, and moonteam/policies/export/onboard.py builds them with NumPy alone. The
-    largest difference from the original, on states that it visits, is printed. Needs the extra
+    what the inputs are and which file (moonteam/policies/export/onboard.py, onboard_pointer.py)
+    builds them with NumPy alone. The largest difference from the original, on states that it
+    visits, is printed: of log-probabilities, or logits of a recurrent policy; of a pointing one, of
+    the logits of all robots and targets, closed ones too, where choices settled at events of
+    missions by the clock are compared instead of actions. Needs the extra
     `export` (onnx, onnxruntime). Exit code 1 if the two differ.
 
     Examples:
@@ -46,14 +49,16 @@ def model_of(policy: Policy) -> bytes:
     try:
         import onnxruntime  # noqa: F401
 
-        from moonteam.policies.export import onnx_graph
+        from moonteam.policies.export import onnx_graph, pointer_graph
     except ImportError as error:
         raise InputError("moonteam export", f"{error.name} is missing; install the extra: "
                          "pip install 'moonteam[export]'") from None
-    from moonteam.policies.brain import EntityBrain, RecurrentBrain
+    from moonteam.policies.brain import EntityBrain, PointerBrain, RecurrentBrain
 
     if isinstance(policy.brain, EntityBrain):
         return onnx_graph.entity_graph(policy.source, policy.brain.spec).SerializeToString()
+    if isinstance(policy.brain, PointerBrain):
+        return pointer_graph.pointer_graph(policy.source, policy.brain.spec).SerializeToString()
     assert isinstance(policy.brain, RecurrentBrain)
     return onnx_graph.recurrent_graph(policy.source, policy.brain.spec).SerializeToString()
 
@@ -81,8 +86,8 @@ def run(args: Args) -> int:
                                "tolerance": TOLERANCE, **found.document()}))
     else:
         print(f"{out}: {len(model):,} bytes; on {found.states} states that the policy visits the "
-              f"largest difference is {found.largest:.2g}, and {found.agree:.2%} of the actions "
-              "are the same")
+              f"largest difference is {found.largest:.2g}, and {found.agree:.2%} of the "
+              f"{'choices' if policy.source.kind == 'pointer' else 'actions'} are the same")
         if not good:
             print(f"more than {TOLERANCE:g}: the file does not decide as the policy does")
     return 0 if good else 1

@@ -17,25 +17,18 @@ Legend: B batch, N agents, M targets, E = N + M tokens, S skill bits, D width, K
 
 from __future__ import annotations
 
-import json
-import math
 from typing import Any
 
 import numpy as np
-from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
+from onnx import ModelProto, TensorProto, helper
 
 from moonteam.policies.entity import FAR, EntitySpec
+from moonteam.policies.export.graph import BOOL, FLOAT, INT, LAST, Graph, block, by_role, model
 from moonteam.policies.policy_file import PolicyFile
 from moonteam.policies.recurrent import RecurrentSpec
 from moonteam.problem.rules import UNREACHABLE
 from moonteam.problem.scenario import MAX_SKILLS
-from moonteam.version import __version__
 
-OPSET, IR = 17, 9
-_LAST = np.iinfo(np.int64).max
-_EPSILON = 1e-6  # of flax's layer norm
-
-INT, FLOAT, BOOL = TensorProto.INT32, TensorProto.FLOAT, TensorProto.BOOL
 ENTITY_INPUTS: dict[str, tuple[int, tuple[str | int, ...], str]] = {
     "agent_cells": (INT, ("agents", 2), "cells (x, y)"),
     "agent_skills": (INT, ("agents",), "bitmask"),
@@ -53,95 +46,25 @@ ENTITY_INPUTS: dict[str, tuple[int, tuple[str | int, ...], str]] = {
 }
 """Type, dimensions after the batch and meaning of each input, in this order."""
 
-
-class _Graph:
-    """Nodes in the making; every method returns the name of its result."""
-
-    def __init__(self, params: Any, outer: _Graph | None = None):
-        """`outer`: of the body of a loop, the graph around it, which keeps the constants."""
-        self.params, self.nodes, self.letter = params, [], "b" if outer else "v"
-        self.constants: dict[str, TensorProto] = outer.constants if outer else {}
-
-    def __call__(self, kind: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
-        names = [f"{self.letter}{len(self.nodes)}_{i}" for i in range(outputs)]
-        self.nodes.append(helper.make_node(kind, inputs, names, **attributes))
-        return names if outputs > 1 else names[0]
-
-    def constant(self, value: Any, kind: Any = np.float32) -> str:
-        """A number or array; equal ones are kept once."""
-        array = np.asarray(value, kind)
-        key = f"c_{array.dtype}_{array.shape}_{array.tobytes().hex()}"
-        if array.size > 8:
-            key = f"w{len(self.constants)}"
-        self.constants.setdefault(key, numpy_helper.from_array(array, key))
-        return key
-
-    def ints(self, *values: int) -> str:
-        return self.constant(values, np.int64)
-
-    def number(self, value: str) -> str:
-        return self("Cast", value, to=FLOAT)
-
-    def add(self, a: str, b: str) -> str:
-        return self("Add", a, b)
-
-    def over(self, value: str, scale: float) -> str:
-        return self("Div", value, self.constant(scale))
-
-    def wide(self, value: str, *axes: int) -> str:
-        """With new axes of length 1."""
-        return self("Unsqueeze", value, self.ints(*axes))
-
-    def join(self, *values: str, axis: int = -1) -> str:
-        return self("Concat", *values, axis=axis)
-
-    def total(self, value: str, axis: int, keep: bool = False) -> str:
-        return self("ReduceSum", value, self.ints(axis), keepdims=int(keep))
-
-    def least(self, value: str, axis: int) -> str:
-        return self("ReduceMin", value, axes=[axis], keepdims=0)
-
-    def part(self, value: str, axis: int, start: str, end: str) -> str:
-        return self("Slice", value, start, end, self.ints(axis))
-
-    def both(self, a: str, b: str) -> str:
-        return self("And", a, b)
-
-    def flipped(self, value: str) -> str:
-        """The last two of three axes exchanged."""
-        return self("Transpose", value, perm=[0, 2, 1])
-
-    def dense(self, params: Any, value: str) -> str:
-        out = self("MatMul", value, self.constant(params["kernel"]))
-        return self.add(out, self.constant(params["bias"])) if "bias" in params else out
-
-    def norm(self, params: Any, value: str) -> str:
-        return self("LayerNormalization", value, self.constant(params["scale"]),
-                    self.constant(params["bias"]), axis=-1, epsilon=_EPSILON)
-
-    def gelu(self, x: str) -> str:
-        """The form by tanh, flax's default."""
-        cube = self("Mul", self("Mul", x, x), self("Mul", x, self.constant(0.044715)))
-        inner = self("Mul", self.add(x, cube), self.constant(math.sqrt(2 / math.pi)))
-        half = self("Mul", x, self.constant(0.5))
-        return self("Mul", half, self.add(self("Tanh", inner), self.constant(1.0)))
+_ABOUT = {"actions": "up (+y), down (-y), left (-x), right (+x), stay",
+          "builder": "moonteam/policies/export/onboard.py (NumPy alone) builds the inputs"}
 
 
-def _bits(g: _Graph, mask: str) -> str:
+def _bits(g: Graph, mask: str) -> str:
     """[...] bitmask -> [..., S] floats."""
     powers = g.constant(2.0 ** np.arange(MAX_SKILLS))
     halves = g("Floor", g("Div", g.wide(g.number(mask), -1), powers))
     return g("Mod", halves, g.constant(2.0), fmod=1)
 
 
-def _usable(g: _Graph, agent: str, need: str) -> str:
+def _usable(g: Graph, agent: str, need: str) -> str:
     """[B, N, M] bool."""
     share = g("Greater", g("MatMul", agent, g.flipped(need)), g.constant(0.5))
     there = g.both(g.wide("target_open", 1), g.wide("agent_mask", 2))
     return g.both(g.both(share, there), g("Less", "travel", g.constant(UNREACHABLE)))
 
 
-def _tokens(g: _Graph, agent: str, need: str, can: str) -> tuple[str, str]:
+def _tokens(g: Graph, agent: str, need: str, can: str) -> tuple[str, str]:
     """[B, N, .] and [B, M, .] features of each entity by itself."""
     real, still = g.number("agent_mask"), g.number("target_open")
     count = g.total(g("Mul", agent, g.wide(real, 2)), 1)
@@ -165,7 +88,7 @@ def _tokens(g: _Graph, agent: str, need: str, can: str) -> tuple[str, str]:
     return agents, targets
 
 
-def _pairs(g: _Graph, agent: str, need: str) -> str:
+def _pairs(g: Graph, agent: str, need: str) -> str:
     """[B, E, E, F] what token j is to token i."""
     here = g.number("agent_cells")
     cells = g.join(here, g.number("target_cells"), axis=1)
@@ -184,39 +107,12 @@ def _pairs(g: _Graph, agent: str, need: str) -> str:
     return g.join(shift, g("Abs", shift), *(g.wide(c, 3) for c in columns))
 
 
-def _by_role(g: _Graph, pairs: str, ends: dict[str, tuple[str, str]]) -> str:
-    """[B, E, E, layers * heads] biases, one reading for each pair of roles."""
-    rows = []
-    for own, (start, end) in ends.items():
-        row = g.part(pairs, 1, start, end)
-        parts = [g.dense(g.params[f"bias_{own}_{other}"], g.part(row, 2, *span))
-                 for other, span in ends.items()]
-        rows.append(g.join(*parts, axis=2))
-    return g.join(*rows, axis=1)
-
-
-def _block(g: _Graph, spec: EntitySpec, params: Any, x: str, bias: str, mask: str) -> str:
-    """A pre-norm attention block; bias [B, K, E, E], mask [B, 1, 1, E]."""
-    size = spec.width // spec.heads
-    qkv = g.dense(params["qkv"], g.norm(params["LayerNorm_0"], x))
-    qkv = g("Reshape", qkv, g.ints(0, 0, spec.heads, 3 * size))
-    q, k, v = g("Split", qkv, g.ints(size, size, size), outputs=3, axis=3)
-    q, v = (g("Transpose", part, perm=[0, 2, 1, 3]) for part in (q, v))
-    k = g("Transpose", k, perm=[0, 2, 3, 1])
-    logits = g.add(g("Mul", g("MatMul", q, k), g.constant(size**-0.5)), bias)
-    logits = g("Where", mask, logits, g.constant(-FAR))
-    mixed = g("Transpose", g("MatMul", g("Softmax", logits, axis=-1), v), perm=[0, 2, 1, 3])
-    x = g.add(x, g.dense(params["out"], g("Reshape", mixed, g.ints(0, 0, spec.width))))
-    y = g.gelu(g.dense(params["up"], g.norm(params["LayerNorm_1"], x)))
-    return g.add(x, g.dense(params["down"], y))
-
-
-def _agree(g: _Graph, pointer: str, agent: str, need: str, agents: str) -> str:
+def _agree(g: Graph, pointer: str, agent: str, need: str, agents: str) -> str:
     """Pointer logits [B, N, M + 1] after all claims, see `entity.agree`; skills are bits.
 
     agent [B, N, S], need [B, M, S], agents [1]: N. One turn of the loop is one agent's claim.
     """
-    b = _Graph(g.params, g)
+    b = Graph(g.params, g)
     none, yes = b.constant(-FAR), b.number("claim_waiting")
     sure = b("ReduceMax", b("LogSoftmax", "claim_logits", axis=-1), axes=[2], keepdims=0)
     turn = b("ArgMax", b("Where", "claim_waiting", sure, b.constant(-2.0 * FAR)), axis=1)
@@ -235,7 +131,7 @@ def _agree(g: _Graph, pointer: str, agent: str, need: str, agents: str) -> str:
     useless = b("Less", b("MatMul", agent, b.flipped(missing)), b.constant(0.5))
     shut = b.both(useless, b.wide(waiting, 2))
     logits = b("Where", shut, none, b.part("claim_logits", 2, b.ints(0), b.ints(-1)))
-    logits = b.join(logits, b.part("claim_logits", 2, b.ints(-1), b.ints(_LAST)))
+    logits = b.join(logits, b.part("claim_logits", 2, b.ints(-1), b.ints(LAST)))
     going = b("Identity", "claim_going")
 
     def info(name: str, kind: int, *dims: str | int) -> Any:
@@ -253,7 +149,7 @@ def _agree(g: _Graph, pointer: str, agent: str, need: str, agents: str) -> str:
              body=body)[0]
 
 
-def _mix(g: _Graph, pointer: str, free: str, share: float) -> None:
+def _mix(g: Graph, pointer: str, free: str, share: float) -> None:
     """Action log-probabilities from pointer and free logits, as the output `log_probs`."""
     weight = g("Softmax", pointer, axis=-1)
     aim = g.part(weight, 2, g.ints(0), g.ints(-1))
@@ -261,7 +157,7 @@ def _mix(g: _Graph, pointer: str, free: str, share: float) -> None:
     moves = g("Div", moves, g("Max", g.total(moves, 3, keep=True), g.constant(1.0)))
     going = g("Squeeze", g("MatMul", g.wide(aim, 2), moves), g.ints(2))
     there = g("Mul", aim, g.number(g("Less", "travel", g.constant(0.5))))
-    still = g.add(g.part(weight, 2, g.ints(-1), g.ints(_LAST)), g.total(there, 2, keep=True))
+    still = g.add(g.part(weight, 2, g.ints(-1), g.ints(LAST)), g.total(there, 2, keep=True))
     able = g("Pad", g.number("allowed"), g.ints(0, 0, 0, 0, 0, 1), g.constant(1.0))
     able = g("Greater", able, g.constant(0.5))
     loose = g("Softmax", g("Where", able, free, g.constant(-FAR)), axis=-1)
@@ -275,19 +171,19 @@ def entity_graph(policy: PolicyFile, spec: EntitySpec) -> ModelProto:
     """The entity network; outputs `log_probs` [B, N, 5], claims settled, and `pointer`
     [B, N, M + 1] as it was before that.
     """
-    g = _Graph(policy.params)
+    g = Graph(policy.params)
     agent, need = _bits(g, "agent_skills"), _bits(g, "target_skills")
     can = _usable(g, agent, need)
     agents, targets = _tokens(g, agent, need, can)
     x = g.join(g.dense(g.params["agent"], agents), g.dense(g.params["target"], targets), axis=1)
     count = g("Gather", g("Shape", "agent_skills"), g.ints(1))
-    spans = {"agent": (g.ints(0), count), "target": (count, g.ints(_LAST))}
+    spans = {"agent": (g.ints(0), count), "target": (count, g.ints(LAST))}
     pairs = g.gelu(g.dense(g.params["pairs"], _pairs(g, agent, need)))
-    biases = g("Transpose", _by_role(g, pairs, spans), perm=[0, 3, 1, 2])
+    biases = g("Transpose", by_role(g, pairs, spans), perm=[0, 3, 1, 2])
     mask = g.wide(g.join("agent_mask", "target_open"), 1, 2)
     for layer in range(spec.layers):
         part = g.part(biases, 1, g.ints(layer * spec.heads), g.ints((layer + 1) * spec.heads))
-        x = _block(g, spec, g.params[f"block{layer}"], x, part, mask)
+        x = block(g, spec, g.params[f"block{layer}"], x, part, mask)
     x = g.norm(g.params["last"], x)
     robots, goals = (g.part(x, 1, *spans[role]) for role in ("agent", "target"))
     query, key = g.dense(g.params["query"], robots), g.dense(g.params["key"], goals)
@@ -305,12 +201,12 @@ def entity_graph(policy: PolicyFile, spec: EntitySpec) -> ModelProto:
                                           "up, down, left, right, stay"),
             helper.make_tensor_value_info("pointer", FLOAT, ["batch", "agents", "choices"],
                                           "logits: each target, then stay")]
-    return _model(g, policy, given, made)
+    return model(g, policy, given, made, **_ABOUT)
 
 
 def recurrent_graph(policy: PolicyFile, spec: RecurrentSpec) -> ModelProto:
     """The recurrent actor: `observation` [N, D] and `memory` [N, H] to `logits`, `memory_out`."""
-    g = _Graph(policy.params["actor"])
+    g = Graph(policy.params["actor"])
     width, p = spec.width, g.params
     x = g("Relu", g.dense(p["embed"], "observation"))
     if spec.memory:
@@ -337,23 +233,7 @@ def recurrent_graph(policy: PolicyFile, spec: RecurrentSpec) -> ModelProto:
     def info(name: str, columns: int, words: str) -> Any:
         return helper.make_tensor_value_info(name, FLOAT, ["agents", columns], words)
 
-    return _model(g, policy, [
+    return model(g, policy, [
         info("observation", spec.obs_size, "as `grid.observe` gives it for the training map"),
         info("memory", units, "zeros at the start, then memory_out of the last decision")],
-        [info("logits", 5, "up, down, left, right, stay"), info("memory_out", units, "")])
-
-
-def _model(g: _Graph, policy: PolicyFile, given: list, made: list) -> ModelProto:
-    graph = helper.make_graph(g.nodes, f"moonteam-{policy.kind}", given, made,
-                              list(g.constants.values()))
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)],
-                              ir_version=IR, producer_name="moonteam",
-                              producer_version=__version__)
-    about = {"kind": policy.kind, "commit": policy.commit,
-             "config": json.dumps(policy.config), "recipe": json.dumps(policy.recipe),
-             "inputs": json.dumps({v.name: v.doc_string for v in given}),
-             "actions": "up (+y), down (-y), left (-x), right (+x), stay",
-             "builder": "moonteam/policies/export/onboard.py (NumPy alone) builds the inputs"}
-    helper.set_model_props(model, about)
-    checker.check_model(model, full_check=True)
-    return model
+        [info("logits", 5, "up, down, left, right, stay"), info("memory_out", units, "")], **_ABOUT)
