@@ -98,8 +98,8 @@ class Args(Printed):
     """Starts of the large-neighbourhood search."""
 
     speeds: tuple[float, ...] = testsets_seconds.SPEEDS
-    """m/s of which each robot of a set by the clock draws one: what a drone, a walker and a rover
-    make over open ground."""
+    """m/s of which each robot of a set by the clock draws one: what our three kinds make
+    over open ground."""
 
 
 def draws(recipe: Recipe, seed: int) -> Iterator[Scenario]:

@@ -12,7 +12,7 @@ import msgspec
 from moonteam.problem.timed import Agent, Known, Target, Timed
 
 SPEEDS = (1.5, 0.36, 0.47)
-"""m/s that a drone, a walker and a rover of ours make over open ground, measured in physics."""
+"""m/s that our three kinds make over open ground, measured in physics."""
 
 
 @dataclass(frozen=True)

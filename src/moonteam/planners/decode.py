@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from moonteam.errors import InputError
 from moonteam.planners.base import SAMPLING
@@ -29,7 +29,7 @@ class Decode:
     watch: bool = False
     rollouts: int = 1
     temperature: float = 1.0
-    usual: bool = False
+    usual: bool = field(default=False, compare=False)
     """Nobody asked for a temperature; it is that of a step."""
 
     @property

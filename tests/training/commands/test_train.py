@@ -67,7 +67,7 @@ def test_options_change_the_preset(capsys):
 
 
 @pytest.mark.parametrize(("words", "line"), [
-    (["nosuch"], "nosuch: no such preset; one of: pi_5t,"),
+    (["nosuch"], "nosuch: no such preset; one of: quick,"),
     ([], "no such preset"),
     (["small", "--bootstrap.num-minibatches", "7"],
      "bootstrap.num_minibatches: 512 environments do not divide into 7 minibatches"),

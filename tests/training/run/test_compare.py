@@ -136,7 +136,7 @@ def harm(kind, path):
     ("twice", "is the same run as"), ("labels", "1 different names are needed, for small"),
     ("missing", "nowhere/config.json: no such file"), ("none", "no run folder is given"),
     ("no looks", "metrics.jsonl: holds no evaluation"), ("torn config", "is not JSON"),
-    ("other kind", "is no run of the presets small, laptop or pi_*"),
+    ("other kind", "is no run of the presets small, laptop, pi_*"),
     ("odd report", "report.json: missing required field `seconds`"),
     ("odd row", "metrics.jsonl: [0].phase: Expected `str`")])
 def test_bad_folders_are_one_line(kind, line, tmp_path, capsys):
