@@ -10,19 +10,11 @@ import numpy as np
 import pytest
 
 from moonteam import grid
+from moonteam.grid.macro.draw import Draw
 
 CONFIG = grid.EnvConfig(num_agents=2, num_targets=2, width=4, height=4, max_steps=6)
 PUBLIC = ("reset", "step", "step_env", "get_obs", "observation_space", "action_space",
           "get_avail_actions", "name", "agent_classes")
-
-
-@pytest.fixture(scope="module")
-def jaxmarl():
-    """JaxMARL's modules; importing them prints, which is not wanted where nobody asks."""
-    import jaxmarl.environments.multi_agent_env as base
-    import jaxmarl.environments.spaces as spaces
-    import jaxmarl.wrappers.baselines as wrappers
-    return {"base": base, "spaces": spaces, "wrappers": wrappers}
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +26,16 @@ def actions_of(env, joint):
     return {a: joint[..., i] for i, a in enumerate(env.agents)}
 
 
-def test_jaxmarl_is_not_needed_at_run_time():
-    code = ("import sys, moonteam.grid as g; g.MoonGrid(); "
+@pytest.mark.parametrize("name", ["MoonGrid", "MoonMacro"])
+def test_jaxmarl_is_not_needed_at_run_time(name):
+    code = (f"import sys, moonteam.grid as g; g.{name}(); "
             "sys.exit(any(m.split('.')[0] in ('jaxmarl', 'gymnax') for m in sys.modules))")
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@pytest.mark.parametrize("env", [
+    grid.MoonGrid(CONFIG), grid.MoonMacro(Draw(agents=(2, 3), targets=(2, 4)))],
+    ids=lambda env: env.name)
 def test_every_public_method_has_the_base_classs_parameters(jaxmarl, env):
     base = jaxmarl["base"].MultiAgentEnv
     for name in PUBLIC:
@@ -48,7 +44,7 @@ def test_every_public_method_has_the_base_classs_parameters(jaxmarl, env):
         if not isinstance(theirs, property):
             assert list(inspect.signature(getattr(base, name)).parameters) == list(
                 inspect.signature(getattr(type(env), name)).parameters), name
-    made = base(num_agents=2)
+    made = base(num_agents=env.num_agents)
     assert env.agents == made.agents
     assert set(vars(made)) <= set(vars(env)), "attributes that wrappers read"
 

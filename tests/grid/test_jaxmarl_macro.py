@@ -1,8 +1,5 @@
 """The macro world's JaxMARL face against JaxMARL's base class and one of its wrappers."""
 
-import inspect
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +11,6 @@ from moonteam.grid.macro import world
 from moonteam.grid.macro.draw import Draw
 
 FAMILY = Draw(agents=(2, 3), targets=(2, 4), sides=(6, 8), speeds=(1.0, 0.5), limit=60.0)
-PUBLIC = ("reset", "step", "step_env", "get_obs", "observation_space", "action_space",
-          "get_avail_actions", "name", "agent_classes")
-
-
-@pytest.fixture(scope="module")
-def jaxmarl():
-    import jaxmarl.environments.multi_agent_env as base
-    import jaxmarl.environments.spaces as spaces
-    import jaxmarl.wrappers.baselines as wrappers
-    return {"base": base, "spaces": spaces, "wrappers": wrappers}
 
 
 @pytest.fixture(scope="module")
@@ -36,25 +23,6 @@ def random_actions(env, state, key):
     may = env.get_avail_actions(state)
     return {a: jnp.argmax(jax.random.gumbel(jax.random.fold_in(key, i), may[a].shape)
                           + jnp.where(may[a], 0.0, -1e9)) for i, a in enumerate(env.agents)}
-
-
-def test_jaxmarl_is_not_needed_at_run_time():
-    code = ("import sys, moonteam.grid as g; g.MoonMacro(); "
-            "sys.exit(any(m.split('.')[0] in ('jaxmarl', 'gymnax') for m in sys.modules))")
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-def test_every_public_method_has_the_base_classs_parameters(jaxmarl, env):
-    base = jaxmarl["base"].MultiAgentEnv
-    for name in PUBLIC:
-        theirs, ours = inspect.getattr_static(base, name), inspect.getattr_static(env, name)
-        assert isinstance(theirs, property) == isinstance(ours, property), name
-        if not isinstance(theirs, property):
-            assert list(inspect.signature(getattr(base, name)).parameters) == list(
-                inspect.signature(getattr(type(env), name)).parameters), name
-    made = base(num_agents=3)
-    assert env.agents == made.agents
-    assert set(vars(made)) <= set(vars(env)), "attributes that wrappers read"
 
 
 def test_episodes_end_and_begin_again(env):

@@ -19,10 +19,7 @@ from jax import Array
 from moonteam.grid.jaxmarl_face import ByAgent, Face, OwnSpaces, Spaces
 from moonteam.grid.macro import world
 from moonteam.grid.macro.draw import Draw, draw
-from moonteam.grid.macro.types import MacroState
-
-LONG = 16.0
-"""Units of time above which it makes no difference how long."""
+from moonteam.grid.macro.types import LONG, MacroState
 
 
 class MoonMacro(Face):
@@ -107,7 +104,4 @@ class MoonMacro(Face):
         Each is right by itself; of agents that choose at once see `step_env`.
         """
         may = world.allowed(state, state.goal)
-        some = jnp.any(may, axis=1)
-        coming = jnp.any((state.busy > 0) & state.problem.agent_mask)
-        wait = coming | (jnp.sum(some) > 1) | ~some
-        return self._split(jnp.concatenate([may, wait[:, None]], axis=1))
+        return self._split(world.with_waiting(may, world.anyone_coming(state)))

@@ -141,11 +141,9 @@ def _family(agents: int, targets: int, size: tuple[int, ...]) -> str:
     return f"{agents} robots and {targets} targets on a map of {size[0]} x {size[1]}"
 
 
-@dataclass(frozen=True)
-class EntityBrain:
-    """The network for any team, any targets, any ground; it has no memory."""
+class _AnyTeam:
+    """A network without memory, for any number of robots and targets and any ground."""
 
-    spec: EntitySpec
     travels = True
     prefers = True
 
@@ -158,6 +156,17 @@ class EntityBrain:
         del episodes, num_agents
         return ()
 
+    def misfit(self, mission: Mission) -> str:
+        """See `Brain`: everything fits."""
+        del mission
+        return ""
+
+
+@dataclass(frozen=True)
+class EntityBrain(_AnyTeam):
+    """The network for any team, any targets, any ground; it has no memory."""
+
+    spec: EntitySpec
     def logits(self, params: Any, memory: tuple[()], states: State, fields: Array | None,
                horizon: Array, preference: Array) -> tuple[tuple[()], Array]:
         """See `Brain`; what is returned are log-probabilities."""
@@ -168,11 +177,6 @@ class EntityBrain:
         view = jax.vmap(look)(states, horizon, preference, fields)
         return memory, entity.decide(params, self.spec, view).log_probs
 
-    def misfit(self, mission: Mission) -> str:
-        """See `Brain`: everything fits."""
-        del mission
-        return ""
-
 
 _LOOSE = 0.25
 """Share of what a pointing agent weighs that its settled choice does not take; below a third, so
@@ -180,7 +184,7 @@ that one of two moves that bring it nearer outweighs staying."""
 
 
 @dataclass(frozen=True)
-class PointerBrain:
+class PointerBrain(_AnyTeam):
     """The network that points at targets, asked anew at every step; it has no memory.
 
     At each moment all agents are free and choose among the targets, claims settled as in
@@ -191,18 +195,6 @@ class PointerBrain:
     """
 
     spec: PointerSpec
-    travels = True
-    prefers = True
-
-    def slots(self, num_targets: int) -> int:
-        """The next multiple of four; padding changes nothing."""
-        return -(-num_targets // 4) * 4
-
-    def begin(self, episodes: int, num_agents: int) -> tuple[()]:
-        """Nothing."""
-        del episodes, num_agents
-        return ()
-
     def logits(self, params: Any, memory: tuple[()], states: State, fields: Array | None,
                horizon: Array, preference: Array) -> tuple[tuple[()], Array]:
         """See `Brain`; what is returned are log-probabilities."""
@@ -214,11 +206,6 @@ class PointerBrain:
         said = pointer.point(params, self.spec, jax.vmap(pointer.look)(moments, preference))
         weight = jax.vmap(_settled)(moments, said.logits)
         return memory, jax.vmap(_moves)(states, fields, weight)
-
-    def misfit(self, mission: Mission) -> str:
-        """See `Brain`: everything fits."""
-        del mission
-        return ""
 
 
 def _settled(state: MacroState, logits: Array) -> Array:

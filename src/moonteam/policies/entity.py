@@ -23,15 +23,13 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax import Array
 
-from moonteam.errors import InputError
 from moonteam.grid.env import available
 from moonteam.grid.travel import distances, first_step
 from moonteam.grid.types import Problem, State
+from moonteam.policies import attention
+from moonteam.policies.attention import FAR
 from moonteam.problem.rules import NUM_ACTIONS, STAY, UNREACHABLE
 from moonteam.problem.scenario import MAX_SKILLS
-
-FAR = 1.0e9
-"""Stands for minus infinity in masked logits, without its not-a-number."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,7 @@ class EntitySpec:
 
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no network."""
-        if min(self.width, self.heads, self.layers) < 1 or self.width % self.heads:
-            raise InputError(source, f"heads ({self.heads}) must divide width ({self.width})")
+        attention.check_sizes(source, self.width, self.heads, self.layers)
 
 
 @jax.tree_util.register_dataclass
@@ -139,26 +136,6 @@ def _pair_features(view: Entities) -> Array:
                    (travel < 0.5).astype(jnp.float32), shared, covers], axis=-1)], axis=-1)
 
 
-class Block(nn.Module):
-    """Pre-norm self-attention with a pair bias, then a small feed-forward layer."""
-
-    spec: EntitySpec
-
-    @nn.compact
-    def __call__(self, x: Array, bias: Array, mask: Array) -> Array:
-        """x [B, E, D], bias [B, E, E, K] added to the logits, mask [B, E] real tokens."""
-        width, heads = self.spec.width, self.spec.heads
-        y = nn.LayerNorm()(x)
-        qkv = nn.Dense(3 * width, use_bias=False, name="qkv")(y)
-        q, k, v = jnp.split(qkv.reshape(*y.shape[:-1], heads, 3 * width // heads), 3, axis=-1)
-        logits = jnp.einsum("...ikd,...jkd->...ijk", q, k) * (width // heads) ** -0.5 + bias
-        logits = jnp.where(mask[..., None, :, None], logits, -FAR)
-        mixed = jnp.einsum("...ijk,...jkd->...ikd", jax.nn.softmax(logits, axis=-2), v)
-        x = x + nn.Dense(width, name="out")(mixed.reshape(y.shape))
-        y = nn.Dense(2 * width, name="up")(nn.LayerNorm()(x))
-        return x + nn.Dense(width, name="down")(nn.gelu(y))
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Decision:
@@ -185,36 +162,12 @@ class Entity(nn.Module):
                              nn.Dense(spec.width, name="target")(targets)], axis=-2)
         mask = jnp.concatenate([view.agent_mask, view.target_open], axis=-1)
         pairs = nn.gelu(nn.Dense(32, name="pairs")(_pair_features(view)))
-        # One bias for each ordered pair of roles: agents and targets read a pair differently.
-        biases = self._by_role(pairs, n, spec.layers * spec.heads, "bias")
-        for layer in range(spec.layers):
-            part = biases[..., layer * spec.heads : (layer + 1) * spec.heads]
-            x = Block(spec, name=f"block{layer}")(x, part, mask)
-        x = nn.LayerNorm(name="last")(x)
-        pointer, free = self._point(x, pairs, view, n)
+        x = attention.attend(x, pairs, mask, n, spec.layers, spec.heads)
+        logits, stay = attention.point(x, pairs, n)
+        pointer = jnp.concatenate([jnp.where(usable(view), logits, -FAR), stay], axis=-1)
+        free = nn.Dense(NUM_ACTIONS, name="free")(x[..., :n, :])
         acting = agree(pointer, view) if self.together else pointer
         return Decision(pointer, mix(acting, free, view, spec.free), self._value(x, mask))
-
-    def _by_role(self, pairs: Array, n: int, outputs: int, name: str) -> Array:
-        """[B, E, E, outputs] linear readings of the pair features, one for each role pair."""
-        rows = []
-        for i, own in ((slice(0, n), "agent"), (slice(n, None), "target")):
-            parts = [nn.Dense(outputs, name=f"{name}_{own}_{other}")(pairs[..., i, j, :])
-                     for j, other in ((slice(0, n), "agent"), (slice(n, None), "target"))]
-            rows.append(jnp.concatenate(parts, axis=-2))
-        return jnp.concatenate(rows, axis=-3)
-
-    def _point(self, x: Array, pairs: Array, view: Entities, n: int) -> tuple[Array, Array]:
-        """Pointer logits [B, N, M + 1] and the free term's logits [B, N, 5]."""
-        width = self.spec.width
-        query = nn.Dense(width, name="query")(x[..., :n, :])
-        key = nn.Dense(width, name="key")(x[..., n:, :])
-        bias = nn.Dense(1, name="point_bias")(pairs[..., :n, n:, :])[..., 0]
-        logits = jnp.einsum("...nd,...md->...nm", query, key) * width**-0.5 + bias
-        logits = jnp.where(usable(view), logits, -FAR)
-        stay = nn.Dense(1, name="stay")(x[..., :n, :])
-        free = nn.Dense(NUM_ACTIONS, name="free")(x[..., :n, :])
-        return jnp.concatenate([logits, stay], axis=-1), free
 
     def _value(self, x: Array, mask: Array) -> Array:
         real = mask[..., None].astype(x.dtype)

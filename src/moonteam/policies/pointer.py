@@ -23,13 +23,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax import Array
 
-from moonteam.errors import InputError
 from moonteam.grid.macro import world
-from moonteam.grid.macro.types import FAR, MacroState
-from moonteam.policies.entity import Block, EntitySpec
-
-LONG = 16.0
-"""Units of time above which it makes no difference how long."""
+from moonteam.grid.macro.types import FAR, LONG, MacroState
+from moonteam.policies import attention
 
 
 @dataclass(frozen=True)
@@ -47,8 +43,7 @@ class PointerSpec:
 
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no network."""
-        if min(self.width, self.heads, self.layers, self.pairs) < 1 or self.width % self.heads:
-            raise InputError(source, f"heads ({self.heads}) must divide width ({self.width})")
+        attention.check_sizes(source, self.width, self.heads, self.layers, self.pairs)
 
 
 @jax.tree_util.register_dataclass
@@ -229,31 +224,9 @@ class Pointer(nn.Module):
                              nn.Dense(spec.width, name="target")(targets)], axis=-2)
         mask = jnp.concatenate([view.agents, view.targets], axis=-1)
         pairs = nn.gelu(nn.Dense(spec.pairs, name="pairs")(_pair_features(view)))
-        # One bias for each ordered pair of roles: agents and targets read a pair differently.
-        biases = self._by_role(pairs, n, spec.layers * spec.heads)
-        sizes = EntitySpec(spec.width, spec.heads, spec.layers)
-        for layer in range(spec.layers):
-            part = biases[..., layer * spec.heads : (layer + 1) * spec.heads]
-            x = Block(sizes, name=f"block{layer}")(x, part, mask)
-        x = nn.LayerNorm(name="last")(x)
-        return Pointed(self._point(x, pairs, n), self._value(x, mask))
-
-    def _by_role(self, pairs: Array, n: int, outputs: int) -> Array:
-        rows = []
-        for i, own in ((slice(0, n), "agent"), (slice(n, None), "target")):
-            parts = [nn.Dense(outputs, name=f"bias_{own}_{other}")(pairs[..., i, j, :])
-                     for j, other in ((slice(0, n), "agent"), (slice(n, None), "target"))]
-            rows.append(jnp.concatenate(parts, axis=-2))
-        return jnp.concatenate(rows, axis=-3)
-
-    def _point(self, x: Array, pairs: Array, n: int) -> Array:
-        width = self.spec.width
-        query = nn.Dense(width, name="query")(x[..., :n, :])
-        key = nn.Dense(width, name="key")(x[..., n:, :])
-        bias = nn.Dense(1, name="point_bias")(pairs[..., :n, n:, :])[..., 0]
-        logits = jnp.einsum("...nd,...md->...nm", query, key) * width**-0.5 + bias
-        stay = nn.Dense(1, name="stay")(x[..., :n, :])
-        return jnp.concatenate([logits, stay], axis=-1)
+        x = attention.attend(x, pairs, mask, n, spec.layers, spec.heads)
+        logits = jnp.concatenate(attention.point(x, pairs, n), axis=-1)
+        return Pointed(logits, self._value(x, mask))
 
     def _value(self, x: Array, mask: Array) -> Array:
         real = mask[..., None]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam.grid.config import EnvConfig
-from moonteam.grid.macro.types import FAR, MacroProblem
+from moonteam.grid.macro.types import FAR, MacroProblem, plain
 from moonteam.grid.sampling import sample
 from moonteam.grid.types import Problem
 from moonteam.problem.scenario import MAX_SKILLS
@@ -68,13 +68,8 @@ def of_grid(problem: Problem, cells: Array, limit: Array | float, metric: Metric
     between = jnp.where(between < FAR, between / pace[:, None, None], FAR)
     has = bits(problem.agent_skills, skills) & problem.agent_mask[:, None]
     need = (bits(problem.target_skills, skills) & problem.target_mask[:, None]).astype(jnp.int32)
-    zero = jnp.zeros(targets)
-    return MacroProblem(
-        start=start, between=between, home=jnp.zeros((agents, targets)),
-        home_now=jnp.zeros(agents), has=has, need=need,
-        either=~problem.target_and, service=zero, after=jnp.zeros((targets, targets), bool),
-        appears=zero, shown=zero, lapses=zero + FAR, free=jnp.zeros(agents),
-        effort=jnp.ones(agents), limit=jnp.asarray(limit, jnp.float32),
+    return plain(
+        start, between, has, need, ~problem.target_and, limit=jnp.asarray(limit, jnp.float32),
         agent_mask=problem.agent_mask, target_mask=problem.target_mask,
         unit=unit_of(start, has, need, problem.agent_mask, problem.target_mask))
 

@@ -8,12 +8,16 @@ float32 seconds (or whatever unit the tables are in). Arrays may be padded: `age
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 from jax import Array
 
 FAR = 1.0e9
 """s that stand for "no way" and "no limit"."""
+
+LONG = 16.0
+"""Units of time above which it makes no difference to an observer how long."""
 
 
 @jax.tree_util.register_dataclass
@@ -39,6 +43,20 @@ class MacroProblem:
     agent_mask: Array  # [N] bool
     target_mask: Array  # [M] bool
     unit: Array  # [] s by which times are divided where numbers of order one are wanted
+
+
+def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: Any,
+          agent_mask: Any, target_mask: Any, unit: Any) -> MacroProblem:
+    """A problem of travel and coalitions alone, of NumPy's arrays or JAX's."""
+    xp = start.__array_namespace__()
+    agents, targets = start.shape
+    nobody, none = xp.zeros(agents, xp.float32), xp.zeros(targets, xp.float32)
+    return MacroProblem(
+        start=start, between=between, home=xp.zeros((agents, targets), xp.float32),
+        home_now=nobody, has=has, need=need, either=either, service=none,
+        after=xp.zeros((targets, targets), bool), appears=none, shown=none,
+        lapses=none + xp.float32(FAR), free=nobody, effort=nobody + 1, limit=limit,
+        agent_mask=agent_mask, target_mask=target_mask, unit=unit)
 
 
 @jax.tree_util.register_dataclass

@@ -29,9 +29,9 @@ def reset(problem: MacroProblem) -> MacroState:
     agents, targets = problem.start.shape
     none = jnp.full(agents, targets, jnp.int32)
     start = MacroState(
-        problem, jnp.zeros(()), none, none, jnp.zeros(agents), none, problem.free,
-        jnp.zeros(targets, bool),
-        ~problem.target_mask, problem.free, jnp.zeros(agents))
+        problem=problem, now=jnp.zeros(()), node=none, origin=none, leg=jnp.zeros(agents),
+        goal=none, busy=problem.free, serving=jnp.zeros(targets, bool),
+        solved=~problem.target_mask, since=problem.free, travelled=jnp.zeros(agents))
     return _run(start, jnp.any(free(start)))[0]
 
 
@@ -95,6 +95,21 @@ def allowed(state: MacroState, goal: Array) -> Array:
     return (open_targets(state) & before)[None] & helps & whole & in_time & free(state)[:, None]
 
 
+def anyone_coming(state: MacroState) -> Array:
+    """[] bool: somebody is on the way, serves, or will be free; so something will happen."""
+    return jnp.any((state.busy > 0) & state.problem.agent_mask)
+
+
+def with_waiting(may: Array, coming: Array) -> Array:
+    """[N, M + 1] bool, what `may` be chosen [N, M] and, last, whether an agent may wait.
+
+    Somebody must go if nobody is on the way (`coming` [] bool): the last who can.
+    """
+    some = jnp.any(may, axis=1)
+    wait = coming | (jnp.sum(some) > 1) | ~some
+    return jnp.concatenate([may, wait[:, None]], axis=1)
+
+
 def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array]:
     """The free agents' choices, one after the other, the surest first.
 
@@ -113,14 +128,12 @@ def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array
     def turn(carry: tuple, _: None) -> tuple[tuple, None]:
         goal, choice, mask, todo, coming = carry
         may = allowed(state, goal) & todo[:, None]  # [N, M]
-        some = jnp.any(may, axis=1)
-        # Somebody must go if nobody is on the way: the last who can.
-        wait = coming | (jnp.sum(some) > 1) | ~some
-        options = jnp.concatenate([may, wait[:, None]], axis=1)
+        options = with_waiting(may, coming)
         held = jnp.where(options, logits, -FAR)
         sure = jnp.max(jax.nn.log_softmax(held, axis=1), axis=1)
         # Who has no choice comes last, not to count as the surest.
-        first = jnp.argmax(jnp.where(todo, jnp.where(some, sure, -2 * FAR), -3 * FAR))
+        order = jnp.where(jnp.any(may, axis=1), sure, -2 * FAR)
+        first = jnp.argmax(jnp.where(todo, order, -3 * FAR))
         pick = jnp.argmax(jnp.where(options[first], logits[first] + noise[first], -FAR))
         pick = pick.astype(jnp.int32)
         own = (everyone == first) & todo
@@ -130,9 +143,8 @@ def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array
         return (goal, choice, mask, todo & ~own, coming | (jnp.any(own) & (pick < targets))), None
 
     alone = jnp.zeros((agents, targets + 1), bool).at[:, targets].set(True)
-    coming = jnp.any((state.busy > 0) & state.problem.agent_mask)
     none = jnp.full(agents, targets, jnp.int32)
-    start = (state.goal, none, alone, free(state), coming)
+    start = (state.goal, none, alone, free(state), anyone_coming(state))
     (_, choice, mask, _, _), _ = jax.lax.scan(turn, start, None, agents)
     return choice, mask
 

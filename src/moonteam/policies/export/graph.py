@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from onnx import ModelProto, TensorProto, checker, helper, numpy_helper
 
-from moonteam.policies.entity import FAR, EntitySpec
+from moonteam.policies.attention import FAR
+from moonteam.policies.entity import EntitySpec
+from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.policy_file import PolicyFile
 from moonteam.version import __version__
 
@@ -123,7 +125,8 @@ def by_role(g: Graph, pairs: str, ends: dict[str, tuple[str, str]]) -> str:
     return g.join(*rows, axis=1)
 
 
-def block(g: Graph, spec: EntitySpec, params: Any, x: str, bias: str, mask: str) -> str:
+def block(g: Graph, spec: EntitySpec | PointerSpec, params: Any, x: str, bias: str,
+          mask: str) -> str:
     """A pre-norm attention block; bias [B, K, E, E], mask [B, 1, 1, E]."""
     size = spec.width // spec.heads
     qkv = g.dense(params["qkv"], g.norm(params["LayerNorm_0"], x))

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from onnx import ModelProto, TensorProto, helper
 
-from moonteam.policies.entity import FAR, EntitySpec
+from moonteam.policies.attention import FAR
+from moonteam.policies.entity import EntitySpec
 from moonteam.policies.export.graph import BOOL, FLOAT, INT, LAST, Graph, block, by_role, model
 from moonteam.policies.policy_file import PolicyFile
 from moonteam.policies.recurrent import RecurrentSpec

@@ -13,9 +13,9 @@ from typing import Any
 
 from onnx import ModelProto, helper
 
-from moonteam.policies.entity import EntitySpec
+from moonteam.grid.macro.types import LONG
 from moonteam.policies.export.graph import BOOL, FLOAT, INT, LAST, Graph, block, by_role, model
-from moonteam.policies.pointer import LONG, PointerSpec
+from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.policy_file import PolicyFile
 
 INPUTS: dict[str, tuple[int, tuple[str, ...], str]] = {
@@ -39,7 +39,7 @@ INPUTS: dict[str, tuple[int, tuple[str, ...], str]] = {
     "preference": (FLOAT, (), "0 time .. 1 effort"),
 }
 """Type, dimensions after the batch and meaning of each input, in this order; times are in units
-of the mission, about 1 for a usual way, and at most `pointer.LONG`."""
+of the mission, about 1 for a usual way, and at most `macro.types.LONG`."""
 
 
 def _log1p(g: Graph, value: str) -> str:
@@ -143,10 +143,9 @@ def pointer_graph(policy: PolicyFile, spec: PointerSpec) -> ModelProto:
     pairs = g.gelu(g.dense(g.params["pairs"], _pairs(g)))
     biases = g("Transpose", by_role(g, pairs, spans), perm=[0, 3, 1, 2])
     mask = g.wide(g.join("agents", "targets", axis=1), 1, 2)
-    sizes = EntitySpec(spec.width, spec.heads, spec.layers)
     for layer in range(spec.layers):
         part = g.part(biases, 1, g.ints(layer * spec.heads), g.ints((layer + 1) * spec.heads))
-        x = block(g, sizes, g.params[f"block{layer}"], x, part, mask)
+        x = block(g, spec, g.params[f"block{layer}"], x, part, mask)
     _point(g, spec, g.norm(g.params["last"], x), pairs, spans)
     given = [helper.make_tensor_value_info(name, kind, ["batch", *dims], words)
              for name, (kind, dims, words) in INPUTS.items()]
