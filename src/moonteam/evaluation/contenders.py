@@ -15,7 +15,7 @@ from moonteam import paths
 from moonteam.errors import InputError
 from moonteam.evaluation.metrics import Outcomes
 from moonteam.evaluation.played import play
-from moonteam.evaluation.world import Walk, World, play_plans, snapshots
+from moonteam.evaluation.world import World, play_plans, snapshots, tally
 from moonteam.planners import decode as decoding
 from moonteam.planners import registry, simulate
 from moonteam.planners.base import (
@@ -112,7 +112,7 @@ class Planned:
             return plans
 
         walk = play_plans(world, plan)
-        return outcomes(self.name, world, walk, spent, first_call)
+        return Outcomes(self.name, *tally(world, walk), spent, first_call)
 
     def _plan_all(self, moments: list[Snapshot], over: BoolArray, title: str,
                   warm: bool) -> tuple[list[IntArray], list[float]]:
@@ -178,14 +178,6 @@ class Learned:
                     + note)
         return Outcomes(self.name, played.success, steps, played.moves, played.seconds,
                         played.compiling, note)
-
-
-def outcomes(name: str, world: World, walk: Walk, seconds: float, first_call: float) -> Outcomes:
-    """What the environment says of episodes that were played to their end."""
-    success = np.asarray(walk.done)
-    steps = np.where(success, np.asarray(walk.state.step), np.asarray(world.horizon))
-    return Outcomes(name, success, steps.astype(np.int64), np.asarray(walk.moves, np.int64),
-                    seconds, first_call)
 
 
 def contenders(options: Options) -> list[Contender]:

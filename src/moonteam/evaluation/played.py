@@ -74,10 +74,8 @@ class _Pointing:
     def play(self, world: World) -> Played:
         """Every scenario as far as it goes."""
         walk = worlds.play_plans(world, self._plan)
-        success = np.asarray(walk.done)
-        steps = np.where(success, np.asarray(walk.state.step), np.asarray(world.horizon))
-        return Played(success, steps.astype(np.int64), np.asarray(walk.moves, np.int64),
-                      np.zeros(len(world), np.int64), self._seconds, self._compiling)
+        return Played(*worlds.tally(world, walk), np.zeros(len(world), np.int64), self._seconds,
+                      self._compiling)
 
     def _plan(self, moments: list[Snapshot], over: BoolArray, round_: int) -> list[npt.ArrayLike]:
         plans: list[npt.ArrayLike] = [np.zeros((0, len(m.cells)), np.int32) for m in moments]

@@ -167,7 +167,7 @@ def _policies(kind: TimedPlannerKind, options: Options, objectives: Sequence[Obj
     """The rows of a planner that decides by a policy, as for scenarios in steps."""
     return [Contender(row.name, kind.make(PlannerOptions(
         row.objective, options.alpha, options.beta, seed=options.seed, policy=row.policy,
-        decode=row.decode.name, preference=row.preference)), alone=options.alone)
+        decode=row.decode.asked, preference=row.preference)), alone=options.alone)
         for row in policies(options, objectives)]
 
 

@@ -170,6 +170,14 @@ def play_plans(world: World, plan: Callable[[list[Snapshot], BoolArray, int],
     return walk
 
 
+def tally(world: World, walk: Walk) -> tuple[BoolArray, npt.NDArray[np.int64],
+                                             npt.NDArray[np.int64]]:
+    """Success, steps (T_max where it failed) and moves [S] of episodes played to their end."""
+    success = np.asarray(walk.done)
+    steps = np.where(success, np.asarray(walk.state.step), np.asarray(world.horizon))
+    return success, steps.astype(np.int64), np.asarray(walk.moves, np.int64)
+
+
 def snapshots(world: World, walk: Walk) -> list[Snapshot]:
     """Every episode's present moment as a host planner sees it."""
     state = jax.tree.map(np.asarray, walk.state)

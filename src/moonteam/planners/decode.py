@@ -29,13 +29,13 @@ class Decode:
     watch: bool = False
     rollouts: int = 1
     temperature: float = 1.0
-    usual: bool = field(default=False, compare=False)
-    """Nobody asked for a temperature; it is that of a step."""
+    asked: str = field(default="", compare=False)
+    """As the user wrote it; `parse` of it gives the same."""
 
     @property
     def heat(self) -> float:
         """Temperature at which targets are drawn; 0: never."""
-        return 0.0 if not self.sample else HELD if self.usual else self.temperature
+        return 0.0 if not self.sample else self.temperature if "@" in self.asked else HELD
 
 
 HELD = 1.0
@@ -62,7 +62,7 @@ def parse(text: str) -> Decode:
     usual = SAMPLING if sample else 1.0
     heat = usual if found["heat"] is None else _temperature(text, found["heat"])
     name = how + ("" if heat == usual else f"@{heat:g}")
-    return Decode(name, sample, how == "argmax", rollouts, heat, found["heat"] is None)
+    return Decode(name, sample, how == "argmax", rollouts, heat, text)
 
 
 def _temperature(text: str, heat: str) -> float:

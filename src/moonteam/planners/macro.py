@@ -273,9 +273,9 @@ def _written(log: _Done, state: MacroState, choice: Array, turn: Array) -> _Done
 def _routed(problems: MacroProblem, done: _Done) -> Rollouts:
     """Everybody straight to what it came to serve, in the order in which that began."""
     played = _times(problems, done)  # [B, K, M]
-    depth = _depth(np.asarray(problems.after))[:, None].astype(np.float64)
+    deep = depth(np.asarray(problems.after))[:, None].astype(np.float64)
     turn = np.where(done.order >= 0, done.order, -1).max(2)
-    sequence = np.lexsort((turn, np.broadcast_to(depth, played.shape), played), axis=-1)
+    sequence = np.lexsort((turn, np.broadcast_to(deep, played.shape), played), axis=-1)
     own = np.swapaxes(done.order >= 0, -1, -2) & np.isfinite(played)[..., None]  # [B, K, M, N]
     agents, targets = problems.start.shape[1:]
     row = np.arange(len(played))[:, None, None]
@@ -310,15 +310,15 @@ def _routed(problems: MacroProblem, done: _Done) -> Rollouts:
     return Rollouts(solved, seconds, cost, done.order, start, end)
 
 
-def _depth(after: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-    """[B, M] how many targets one behind the other come before each."""
-    depth = np.zeros(after.shape[:2], np.int64)
-    for _ in range(after.shape[1]):
-        deeper = np.where(after, depth[:, None] + 1, 0).max(-1, initial=0)
-        if (deeper <= depth).all():
+def depth(after: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """[..., M] how many targets one behind the other come before each; after [..., M, M]."""
+    deep = np.zeros(after.shape[:-1], np.int64)
+    for _ in range(after.shape[-1]):
+        deeper = np.where(after, deep[..., None, :] + 1, 0).max(-1, initial=0)
+        if (deeper <= deep).all():
             break
-        depth = np.maximum(depth, deeper)
-    return depth
+        deep = np.maximum(deep, deeper)
+    return deep
 
 
 def _times(problems: MacroProblem, done: _Done) -> npt.NDArray[np.float64]:

@@ -10,11 +10,10 @@ Legend: N agents, M open targets, S skills, K tries.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from moonteam.grid.macro.types import FAR, MacroProblem
+from moonteam.grid.macro.types import FAR, MacroProblem, plain
 from moonteam.planners import macro
 from moonteam.planners.base import IntArray, Snapshot
 from moonteam.planners.best_of import cheapest, meaning, prices
@@ -29,22 +28,16 @@ from moonteam.policies.policy import Policy
 
 def problem_of(task: Task) -> MacroProblem:
     """The task by the clock, NumPy arrays; without a limit, its horizon is the planner's affair."""
-    agents, targets = task.start.shape
+    targets = task.start.shape[1]
     length = max(int(np.bitwise_or.reduce(np.concatenate([task.skills, task.need, [1]]))), 1)
     bits = np.arange(length.bit_length())
     has = (task.skills[:, None] >> bits & 1).astype(bool)
     need = (task.need[:, None] >> bits & 1).astype(np.int32)
     start, between = (np.where(ways < UNREACHABLE, ways, FAR).astype(np.float32)
                       for ways in (task.start, task.between[task.kinds]))
-    none, nobody = np.zeros(targets, np.float32), np.zeros(agents, np.float32)
-    columns: dict[str, Any] = {
-        "start": start, "between": between, "home": np.zeros((agents, targets), np.float32),
-        "home_now": nobody, "has": has, "need": need, "either": ~task.both, "service": none,
-        "after": np.zeros((targets, targets), bool), "appears": none, "shown": none,
-        "lapses": none + np.float32(FAR), "free": nobody, "effort": nobody + 1,
-        "limit": np.float32(FAR), "agent_mask": task.skills > 0,
-        "target_mask": np.ones(targets, bool), "unit": macro.unit_of(start, has, need)}
-    return MacroProblem(**columns)
+    return plain(start, between, has, need, ~task.both, limit=np.float32(FAR),
+                 agent_mask=task.skills > 0, target_mask=np.ones(targets, bool),
+                 unit=macro.unit_of(start, has, need))
 
 
 def chosen(found: macro.Rollouts, horizons: Sequence[int],

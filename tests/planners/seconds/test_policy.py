@@ -2,28 +2,29 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
 from moonteam.errors import InputError
+from moonteam.evaluation import timed
+from moonteam.evaluation.contenders import Options
 from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.seconds import registry
 from moonteam.planners.seconds.base import NEVER
 from moonteam.planners.seconds.exact import ExactPlanner
-from moonteam.policies import pointer, policy_file
 from moonteam.policies.policy import Policy
 
 
 @pytest.fixture(scope="module")
-def policy(tmp_path_factory):
-    """Untrained, from its file."""
-    spec = pointer.PointerSpec(width=8, heads=2, layers=1, pairs=4)
-    path = tmp_path_factory.mktemp("policy") / "fresh.safetensors"
-    policy_file.save_policy(path, policy_file.PolicyFile(
-        "pointer", {"width": 8, "heads": 2, "layers": 1, "pairs": 4},
-        jax.device_get(pointer.init(spec, jax.random.key(0)))))
-    return Policy.load(path)
+def policy(pointing):
+    return Policy.load(pointing)
+
+
+@pytest.mark.parametrize(("decode", "heat"), [
+    ("argmax", 0.0), ("best-of-4", 1.0), ("best-of-4@0.5", 0.5), ("sample@2", 2.0)])
+def test_the_temperature_asked_for_reaches_the_planner(pointing, decode, heat):
+    rows = timed.contenders(Options(["policy"], policies=[pointing], decodes=(decode,)))
+    assert [row.planner.heat for row in rows] == [heat]
 
 
 def planner(policy, **options):

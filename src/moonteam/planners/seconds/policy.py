@@ -19,7 +19,6 @@ from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.macro import Rollouts
 from moonteam.planners.seconds.base import (
     MS,
-    Bools,
     Moment,
     Service,
     TimedPlan,
@@ -106,7 +105,7 @@ def _timed(now: Moment, played: Rollouts, row: int, k: int) -> tuple[Service, ..
     sent = played.order[row, k, :len(now.present), :targets]
     served = np.flatnonzero(np.isfinite(start) & ~now.solved)
     # Of services that start together without a length, what comes before, then who set out first.
-    by_time = np.lexsort((sent.max(0)[served], _depth(now.after)[served], end[served],
+    by_time = np.lexsort((sent.max(0)[served], macro.depth(now.after)[served], end[served],
                           start[served]))
     order = [(j, tuple(np.flatnonzero(sent[:, j] >= 0).tolist()))
              for j in served[by_time].tolist()]
@@ -130,13 +129,3 @@ def _needed(team: tuple[int, ...], target: int, now: Moment, sent: np.ndarray
             left = rest
     return tuple(left)
 
-
-def _depth(after: Bools) -> np.ndarray:
-    """[M] how many targets one behind the other come before each."""
-    depth = np.zeros(len(after), np.int64)
-    for _ in range(len(after)):
-        deeper = np.where(after, depth[None] + 1, 0).max(1, initial=0)
-        if (deeper <= depth).all():
-            break
-        depth = np.maximum(depth, deeper)
-    return depth
