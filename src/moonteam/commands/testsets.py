@@ -6,12 +6,9 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import msgspec
 
 from moonteam import files
 from moonteam.commands import testsets_seconds
@@ -149,25 +146,13 @@ def best_known(scenario: Scenario, iterations: int, starts: int) -> Optimal | No
 
 def make(recipe: Recipe, args: Args, update: Callable[[int, str], None]) -> list[Scenario]:
     """One set; `update(done, words)` is told about progress."""
-    from moonteam.compilation import cores
-
-    wanted = args.count or recipe.count
-    source, found = draws(recipe, args.seed), []
-
     def judge(scenario: Scenario) -> Optimal | None:
         if recipe.certified:
             return certify(scenario)
         return best_known(scenario, args.iterations, args.starts)
 
-    with ThreadPoolExecutor(cores()) as pool:
-        while len(found) < wanted:
-            batch = [next(source) for _ in range(min(wanted - len(found), 50))]
-            for scenario, optimal in zip(batch, pool.map(judge, batch), strict=True):
-                if optimal is not None:
-                    name = f"{recipe.name()}-{len(found):04d}"
-                    found.append(msgspec.structs.replace(scenario, id=name, optimal=optimal))
-            update(len(found), f"{len(found)} of {wanted}")
-    return found
+    return testsets_seconds.judged(recipe.name(), draws(recipe, args.seed), judge,
+                                   args.count or recipe.count, update)
 
 
 def run(args: Args) -> int:

@@ -6,10 +6,13 @@ import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import msgspec
 
 from moonteam.problem.timed import Agent, Known, Target, Timed
+
+T = TypeVar("T", bound=msgspec.Struct)
 
 SPEEDS = (1.5, 0.36, 0.47)
 """m/s that our three kinds make over open ground, measured in physics."""
@@ -64,16 +67,25 @@ def certify(problem: Timed) -> Known | None:
 def make(recipe: Recipe, count: int, seed: int, speeds: tuple[float, ...],
          update: Callable[[int, str], None]) -> list[Timed]:
     """One set; `update(done, words)` is told about progress."""
+    return judged(recipe.name(), draws(recipe, seed, speeds), certify, count, update)
+
+
+def judged(name: str, source: Iterator[T], judge: Callable[[T], Any], count: int,
+           update: Callable[[int, str], None]) -> list[T]:
+    """The first `count` scenarios or problems of a source that `judge` knows an optimum of.
+
+    They are numbered, and hold what it said; it is asked on all cores.
+    """
     from moonteam.compilation import cores
 
-    source, found = draws(recipe, seed, speeds), []
+    found: list[T] = []
     with ThreadPoolExecutor(cores()) as pool:
         while len(found) < count:
             batch = [next(source) for _ in range(min(count - len(found), 50))]
-            for problem, optimal in zip(batch, pool.map(certify, batch), strict=True):
+            for one, optimal in zip(batch, pool.map(judge, batch), strict=True):
                 if optimal is not None:
-                    name = f"{recipe.name()}-{len(found):04d}"
-                    found.append(msgspec.structs.replace(problem, id=name, optimal=optimal))
+                    found.append(msgspec.structs.replace(
+                        one, id=f"{name}-{len(found):04d}", optimal=optimal))
             update(len(found), f"{len(found)} of {count}")
     return found
 
