@@ -46,7 +46,7 @@ class Args(Watched):
 
 def parse(words: list[str]) -> Args:
     """Arguments; the preset's numbers are the defaults of all options."""
-    default = Args(configs.preset(words[0]))
+    default = Args(configs.PRESETS[words[0]])
     return parse_words(Args, f"train {words[0]}", words[1:], default)
 
 

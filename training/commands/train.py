@@ -28,6 +28,10 @@ REFINE = "refine"
 """MAPPO from an imitated policy; see `training.commands.refine`."""
 COMPARE = "compare"
 """Runs side by side; see `training.commands.compare`."""
+ELSEWHERE = dict.fromkeys(MACRO, "macro") | {name: name for name in (IMITATE, REFINE, COMPARE)}
+"""First words with options of their own, and the modules that read them."""
+NAMES = (*MACRO, f"{IMITATE} quick", f"{IMITATE} any_team", REFINE)
+"""What else there is to train."""
 
 
 @dataclass(frozen=True)
@@ -79,37 +83,16 @@ def parse(words: list[str]) -> Any:
 
     Raises InputError for a preset that does not exist.
     """
-    if words and words[0] in MACRO:
-        from training.commands import macro
-
-        return macro.parse(words)
-    if words and words[0] == IMITATE:
-        from training.commands import imitate
-
-        return imitate.parse(words[1:])
-    if words and words[0] == REFINE:
-        from training.commands import refine
-
-        return refine.parse(words[1:])
-    if words and words[0] == COMPARE:
-        from training.commands import compare
-
-        return compare.parse(words[1:])
+    if words and (module := ELSEWHERE.get(words[0])):
+        found = importlib.import_module(f"training.commands.{module}")
+        return found.parse(words if words[0] in MACRO else words[1:])
     named = bool(words) and not words[0].startswith("-")
     asks_help = any(word in ("-h", "--help") for word in words)
     if not named and not asks_help:
-        preset("" if not words else words[0])
+        configs.preset("" if not words else words[0], NAMES)
     name, rest = (words[0], words[1:]) if named else ("small", words)
-    default = Args(preset(name))
+    default = Args(configs.preset(name, NAMES))
     return parse_words(Args, f"train {name if named else 'PRESET'}", rest, default)
-
-
-def preset(name: str) -> Config:
-    """The preset of that name, a cell a decision. Raises InputError listing all names."""
-    if name not in configs.PRESETS:
-        raise InputError(name, "no such preset; one of: " + ", ".join(
-            [*MACRO, *configs.PRESETS, f"{IMITATE} quick", f"{IMITATE} any_team", REFINE]))
-    return configs.PRESETS[name]
 
 
 def run(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> int:

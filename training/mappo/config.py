@@ -6,6 +6,7 @@ stated there. Checked when built: an impossible division never reaches the first
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -196,8 +197,8 @@ PRESETS = {
 """`pi_5t5r` takes the five-target figures: the paper lists none of its own."""
 
 
-def preset(name: str) -> Config:
-    """The preset of that name. Raises InputError listing the names."""
+def preset(name: str, others: Sequence[str] = ()) -> Config:
+    """The preset of that name. Raises InputError listing the names, those of `others` too."""
     if name not in PRESETS:
-        raise InputError(name, f"no such preset; one of: {', '.join(PRESETS)}")
+        raise InputError(name, f"no such preset; one of: {', '.join([*others, *PRESETS])}")
     return PRESETS[name]

@@ -22,14 +22,11 @@ from moonteam.grid.types import State
 from moonteam.planners.batch import BatchPlans, solve_batch
 from moonteam.planners.exact import MAX_TARGETS
 from moonteam.policies.entity import Entities, look
+from training.mappo.macro.grounds import blocked
 from training.sharding import everywhere, spread
 
 TIE_BREAK = 0.05
 """Weight that makespan and moves both keep at either end of the preference."""
-
-KINDS = ("a", "b", "c")
-"""Labels of kinds on the grid, from the one that crosses everything on."""
-
 
 @dataclass(frozen=True)
 class Family:
@@ -90,25 +87,12 @@ class Sample(NamedTuple):
 
 
 def make_ground(family: Family, seed: int) -> Ground | None:
-    """The family's maps with blocked cells, from a seed; None for open maps.
-
-    The first kind crosses everything; the second is refused up to a fifth of the cells, the third
-    more.
-    """
+    """The family's maps with blocked cells (`blocked`), from a seed; None for open maps."""
     if not family.grounds:
         return None
     rng = np.random.default_rng(seed)
-    problems = []
-    for _ in range(family.grounds):
-        some = float(rng.uniform(0.02, 0.2))
-        more = some + float(rng.uniform(0.02, 0.15))
-        blocked: dict[str, float] = dict(zip(KINDS, (0.0, some, more), strict=True))
-        kinds = [KINDS[i % 3] for i in range(family.num_agents)]
-        made = scenarios.generate(
-            rng, num_agents=family.num_agents, num_targets=family.num_targets,
-            num_skills=family.num_skills, size=(family.sides[1], family.sides[1]),
-            max_steps=family.max_steps, blocked=blocked, kinds=kinds)
-        problems.append(scenarios.to_problem(made))
+    problems = [blocked(rng, family.num_agents, family.num_targets, family.num_skills,
+                        family.sides[1], family.max_steps) for _ in range(family.grounds)]
     problem, cells = scenarios.stack(problems)
     states = jax.vmap(lambda p, c: env.reset_to(family.config, p, c)[0])(problem, cells)
     fields = jax.lax.map(lambda p: travel.distance_fields(p.passable, p.target_cells, p.size),

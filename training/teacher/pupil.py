@@ -20,6 +20,7 @@ from jax import Array
 
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.policy_file import PolicyFile
+from training.run.families import mean
 from training.run.trainee import Made, Position, Row
 from training.sharding import everywhere, gather, mesh_for
 from training.teacher.curve import draw_curve
@@ -213,7 +214,7 @@ class Pupil(ABC):
 
     def score(self, row: Row) -> float | None:
         """Mean success over the families."""
-        return _mean(row, "success") if "families" in row else None
+        return mean(row, "success") if "families" in row else None
 
     def fallen(self, rows: list[Row]) -> str:
         """Not looked for: a teacher is there."""
@@ -223,8 +224,8 @@ class Pupil(ABC):
         """Where it is, and how it did when last looked at."""
         row, look = rows[-1], next(r for r in reversed(rows) if "families" in r)
         return (f"round {row['update']:,} of {self.config.rounds:,}, loss {row['loss']:.3f}\n"
-                f"held out {_mean(look, 'success'):.3f} success, gaps of makespan "
-                f"{_mean(look, 'makespan_gap'):.1%}, moves {_mean(look, 'moves_gap'):.1%}")
+                f"held out {mean(look, 'success'):.3f} success, gaps of makespan "
+                f"{mean(look, 'makespan_gap'):.1%}, moves {mean(look, 'moves_gap'):.1%}")
 
     def policy(self, at: Position, commit: str) -> PolicyFile:
         """The running mean with network, recipe and commit in the header."""
@@ -246,7 +247,3 @@ class Pupil(ABC):
     def draw_curve(self, path: Path, rows: list[Row]) -> None:
         """Success and gaps of every family over labelled states."""
         draw_curve(path, {self.name: rows})
-
-
-def _mean(row: Row, key: str) -> float:
-    return float(np.mean([family[key] for family in row["families"]]))

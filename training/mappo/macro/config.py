@@ -122,11 +122,3 @@ PRESETS = {
                           limit=8000.0), shrink=16),
         ), rounds=320, hyper=replace(HYPER, spread=True), chunk_rounds=2, eval_every=5),
 }
-
-
-
-def preset(name: str) -> MacroConfig:
-    """The preset of that name. Raises InputError listing the names."""
-    if name not in PRESETS:
-        raise InputError(name, f"no such preset; one of: {', '.join(PRESETS)}")
-    return PRESETS[name]

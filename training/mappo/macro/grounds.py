@@ -22,26 +22,34 @@ KINDS = ("a", "b", "c")
 """Labels of kinds on the grid, from the one that crosses everything on."""
 
 
+def blocked(rng: np.random.Generator, agents: int, targets: int, skills: int, side: int,
+            max_steps: int) -> tuple[Problem, Array]:
+    """A random problem on a square map with closed cells, and the agents' cells.
+
+    The first kind crosses everything; the second is refused up to a fifth of the cells, the third
+    more.
+    """
+    some = float(rng.uniform(0.02, 0.2))
+    more = some + float(rng.uniform(0.02, 0.15))
+    shares: dict[str, float] = dict(zip(KINDS, (0.0, some, more), strict=True))
+    return scenarios.to_problem(scenarios.generate(
+        rng, num_agents=agents, num_targets=targets, num_skills=skills, size=(side, side),
+        max_steps=max_steps, blocked=shares, kinds=[KINDS[i % 3] for i in range(agents)]))
+
+
 def make(family: Draw, count: int, seed: int) -> MacroProblem:
     """[P] problems of the family's most robots and targets, steps of a second, Manhattan ways.
 
-    The first kind crosses everything; the second is refused up to a fifth of the cells, the third
-    more. Speeds, services and the like are for `draw.asking`.
+    Speeds, services and the like are for `draw.asking`.
     """
     rng = np.random.default_rng(seed)
+    few, most = family.targets
     made = []
     for number in range(count):
-        some = float(rng.uniform(0.02, 0.2))
-        more = some + float(rng.uniform(0.02, 0.15))
         side = int(rng.integers(family.sides[0], family.sides[1] + 1))
-        blocked: dict[str, float] = dict(zip(KINDS, (0.0, some, more), strict=True))
-        few, most = family.targets  # the first has the most: all are padded to its shape
-        drawn = scenarios.generate(
-            rng, num_agents=family.agents[1],
-            num_targets=int(rng.integers(few, most + 1)) if number else most,
-            num_skills=family.num_skills, size=(side, side), max_steps=1024, blocked=blocked,
-            kinds=[KINDS[i % 3] for i in range(family.agents[1])])
-        made.append(scenarios.to_problem(drawn))
+        # The first has the most targets: all are padded to its shape.
+        targets = int(rng.integers(few, most + 1)) if number else most
+        made.append(blocked(rng, family.agents[1], targets, family.num_skills, side, 1024))
     problems, cells = scenarios.stack(made)
     tables = jax.jit(jax.vmap(lambda p, c: _tables(family, p, c)))
     parts = [jax.tree.map(np.asarray, tables(*jax.tree.map(lambda x, i=i: x[i:i + 64],

@@ -19,7 +19,8 @@ from training.mappo.macro import grounds
 from training.mappo.macro.config import MacroConfig
 from training.mappo.macro.curve import draw_curve
 from training.mappo.macro.held_out import HeldOut
-from training.mappo.macro.update import Learner, Report, Walk, fresh, several
+from training.mappo.macro.update import Learner, Report, Walk, fresh, update
+from training.run.families import mean
 from training.run.trainee import Made, Position, Row
 from training.sharding import everywhere, gather, mesh_for, spread
 
@@ -87,21 +88,17 @@ class MacroMappo:
         config = self.config
         count = min(config.chunk_rounds, config.rounds - at.update)
         reports = []
-        # One family makes all its updates in one call; several take turns.
-        calls = 1 if len(config.families) == 1 else count
-        for call in range(calls):
-            rounds = np.arange(count // calls) + at.update + call
-            share = rounds / config.rounds
-            lr = (config.lr * (1.0 - 0.95 * share)).astype(np.float32)
-            entropy = (config.ent_coef * np.maximum(0.0, 1.0 - 1.2 * share)).astype(np.float32)
+        for number in range(at.update, at.update + count):
+            share = number / config.rounds
+            lr = np.float32(config.lr * (1.0 - 0.95 * share))
+            entropy = np.float32(config.ent_coef * max(0.0, 1.0 - 1.2 * share))
             for i, family in enumerate(config.families):
-                keys = jnp.stack([jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
-                                                     int(r) * len(config.families) + i)
-                                  for r in rounds])
+                key = jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
+                                         number * len(config.families) + i)
                 with jax.default_matmul_precision(PRECISION[config.precision]):
-                    self.learner, self.walks[i], report = several(
+                    self.learner, self.walks[i], report = update(
                         self.mesh, config.spec, family.draw, config.hyper, self.grounds[i],
-                        self.learner, self.walks[i], keys, lr, entropy)
+                        self.learner, self.walks[i], key, lr, entropy)
                 reports.append(report)
         return Made(count, count * config.decisions, _summary(gather(reports)))
 
@@ -150,11 +147,11 @@ class MacroMappo:
         """Mean success over the families, less the mean gap: both count."""
         if "families" not in row:
             return None
-        return _mean(row, "success") - _mean(row, "makespan_gap")
+        return mean(row, "success") - mean(row, "makespan_gap")
 
     def fallen(self, rows: list[Row]) -> str:
         """When success on the held-out problems has fallen to half of what it was."""
-        found = [_mean(row, "success") for row in rows if "families" in row]
+        found = [mean(row, "success") for row in rows if "families" in row]
         if len(found) < 3 or max(found[-3:]) > max(found) / 2:
             return ""
         return f"it solves {found[-1]:.3f} of the held-out problems, and solved {max(found):.3f}"
@@ -164,7 +161,7 @@ class MacroMappo:
         row, look = rows[-1], next(r for r in reversed(rows) if "families" in r)
         return (f"round {row['update']:,} of {self.config.rounds:,}, {row['rate']:,.0f} decisions/s"
                 f", entropy {row['entropy']:.2f}, critic error {row['value_loss']:.3f}\n"
-                f"held out {_mean(look, 'success'):.3f} success, {_mean(look, 'makespan_gap'):.1%} "
+                f"held out {mean(look, 'success'):.3f} success, {mean(look, 'makespan_gap'):.1%} "
                 "over the optimum")
 
     def policy(self, at: Position, commit: str) -> PolicyFile:
@@ -187,15 +184,12 @@ class MacroMappo:
         draw_curve(path, {self.name: [rows]})
 
 
-def _mean(row: Row, key: str) -> float:
-    return float(np.mean([family[key] for family in row["families"]]))
-
 
 def _summary(reports: list[Report]) -> dict[str, float]:
-    """Means over a chunk's updates."""
-    whole = {name: np.concatenate([np.ravel(getattr(r, name)) for r in reports])
+    """Means over a chunk's updates, of episodes weighed by how many ended."""
+    whole = {name: np.array([getattr(report, name) for report in reports])
              for name in Report._fields}
     weight = np.maximum(whole["episodes"], 1)
-    row = {name: float(np.average(whole[name], weights=weight)) for name in ("success", "seconds")}
-    row = {"success": row["success"], "episode_seconds": row["seconds"]}
+    row = {"success": float(np.average(whole["success"], weights=weight)),
+           "episode_seconds": float(np.average(whole["seconds"], weights=weight))}
     return row | {name: float(whole[name].mean()) for name in ("entropy", "value_loss", "clipped")}

@@ -215,10 +215,10 @@ def loss(params: Any, spec: PointerSpec, hyper: Hyper, batch: Batch,
         [spread, critic, clipped])
 
 
-def update(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem | None,
-           learner: Learner, walk: Walk, key: Array, lr: Array,
-           entropy_weight: Array) -> tuple[Learner, Walk, Report]:
-    """Collect, then improve; inside `several`, on each device with its own environments."""
+def _on_each(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem | None,
+             learner: Learner, walk: Walk, key: Array, lr: Array,
+             entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+    """`update` on one device, with its own environments."""
     collect_key, order_key = jax.random.split(jax.random.fold_in(key, jax.lax.axis_index(AXIS)))
     walk, rows, last, lengths = collect(spec, family, hyper, ground, learner.params, walk,
                                         collect_key)
@@ -264,24 +264,16 @@ def update(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem |
 
 @partial(jax.jit, static_argnames=("mesh", "spec", "family", "hyper"),
          donate_argnames=("learner", "walk"))
-def several(mesh: Mesh, spec: PointerSpec, family: Draw, hyper: Hyper,
-            ground: MacroProblem | None, learner: Learner, walk: Walk, keys: Array, lr: Array,
-            entropy_weight: Array) -> tuple[Learner, Walk, Report]:
-    """One update for each of `keys`, `lr` and `entropy_weight` [U].
+def update(mesh: Mesh, spec: PointerSpec, family: Draw, hyper: Hyper,
+           ground: MacroProblem | None, learner: Learner, walk: Walk, key: Array, lr: Array,
+           entropy_weight: Array) -> tuple[Learner, Walk, Report]:
+    """Collect, then improve.
 
     The environments are shared out over the devices of `mesh`; gradients are the mean of theirs.
     """
-    def all_of_them(ground: MacroProblem | None, learner: Learner, walk: Walk, keys: Array,
-                    lr: Array, entropy_weight: Array) -> tuple[Learner, Walk, Report]:
-        def one(carry: tuple[Learner, Walk], at: tuple) -> tuple[tuple[Learner, Walk], Report]:
-            learner, walk, report = update(spec, family, hyper, ground, *carry, *at)
-            return (learner, walk), report
-
-        (learner, walk), reports = jax.lax.scan(one, (learner, walk), (keys, lr, entropy_weight))
-        return learner, walk, reports
-
     whole, shared = PartitionSpec(), PartitionSpec(AXIS)
     return jax.shard_map(
-        all_of_them, mesh=mesh, in_specs=(whole, whole, shared, whole, whole, whole),
+        partial(_on_each, spec, family, hyper), mesh=mesh,
+        in_specs=(whole, whole, shared, whole, whole, whole),
         out_specs=(whole, shared, whole), check_vma=False)(
-            ground, learner, walk, keys, lr, entropy_weight)
+            ground, learner, walk, key, lr, entropy_weight)
