@@ -8,7 +8,7 @@ from typing import Literal
 from moonteam.errors import InputError
 from moonteam.grid.macro.draw import Draw
 from moonteam.policies.pointer import PointerSpec
-from training.mappo.macro.update import Hyper
+from training.mappo.macro.hyper import Hyper, Vine
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class Practice:
     grounds: int = 0
     """P, maps with blocked cells made beforehand and drawn from; 0: open maps."""
     shrink: int = 1
-    """Environments are this many times fewer: large problems cost more."""
+    """Environments, or moments branched, are this many times fewer: large problems cost more."""
+    advantages: Literal["vine", "critic"] = "vine"
+    """From branches played out, or from the critic."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class MacroConfig:
     """E, environments of each family."""
     hyper: Hyper = field(default_factory=Hyper)
     """Of an update."""
+    vine: Vine = field(default_factory=Vine)
+    """Of an update by branches."""
     spec: PointerSpec = field(default_factory=PointerSpec)
     """Size of the network."""
     lr: float = 1e-3
@@ -72,12 +76,35 @@ class MacroConfig:
             raise InputError(self.macro, f"{self.hyper.learned:g} is not allowed; above 0, at most "
                              "1", "hyper.learned")
         for one in self.families:
+            if one.advantages == "vine":
+                self._check(one)
+                continue
             rows = self.rows(one)
             if self.envs(one) < 1 or rows < 1 or rows % self.hyper.minibatches:
                 raise InputError(
                     self.macro, f"{self.hyper.minibatches} minibatches do not divide the {rows} "
                     f"moments learned from of {self.envs(one)} environments x "
                     f"{self.hyper.num_steps} decisions of {one.name}", "hyper.minibatches")
+
+    def _check(self, family: Practice) -> None:
+        vine = self.grown(family)
+        if min(vine.episodes, vine.moments, vine.options - 1, vine.epochs, vine.num_steps) < 1:
+            raise InputError(self.macro, f"{vine} of {family.name} is not allowed; at least 1 of "
+                             "each, and 2 options", "vine")
+        if vine.moments % vine.minibatches or vine.moments > vine.episodes * vine.num_steps:
+            raise InputError(self.macro, f"{vine.moments} moments of {family.name} are not "
+                             f"divided by {vine.minibatches} minibatches, or are more than its "
+                             f"{vine.episodes} x {vine.num_steps} decisions", "vine.moments")
+
+    def grown(self, family: Practice) -> Vine:
+        """Of a family: fewer moments of large problems, in fewer minibatches of the same size."""
+        vine, most = self.vine, family.draw.targets[1]
+        steps = vine.num_steps or 2 * most
+        # As many decisions as the paper's team would take, in episodes of this length.
+        episodes = vine.episodes // family.shrink * (vine.num_steps or 14) // steps
+        return replace(vine, num_steps=steps, episodes=max(8, episodes // 8 * 8),
+                       moments=vine.moments // family.shrink,
+                       minibatches=max(1, vine.minibatches // family.shrink))
 
     def envs(self, family: Practice) -> int:
         """Environments of a family."""
@@ -89,36 +116,40 @@ class MacroConfig:
 
     @property
     def decisions(self) -> int:
-        """Moments decided in a round, of all families."""
-        return sum(self.envs(f) * self.hyper.num_steps for f in self.families)
+        """Moments in a round from which is learned or that are decided, of all families."""
+        return sum(self.grown(f).moments if f.advantages == "vine"
+                   else self.envs(f) * self.hyper.num_steps for f in self.families)
 
 
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())
 HYPER = Hyper(loose=0.2)
 
 PRESETS = {
-    "quick": MacroConfig("quick", (PAPER,), rounds=180, hyper=HYPER),
-    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=1050, hyper=HYPER),
+    "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER),
+    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER),
     "any_team": MacroConfig(
         "any_team", (
             PAPER,
             Practice("3 unlike robots, 1 to 8 targets",
                      Draw(targets=(1, 8), metric="either", unlike=0.8, service=1.0, numbers=2,
                           homes=0.2, sides=(16, 48), limit=4000.0), shrink=2),
-            Practice("2 to 4 robots, 3 to 9 targets, 3 skills",
-                     Draw(agents=(2, 4), targets=(3, 9), num_skills=3, sides=(8, 64),
+            Practice("2 to 5 robots, 3 to 10 targets, 3 skills",
+                     Draw(agents=(2, 5), targets=(3, 10), num_skills=3, sides=(8, 64),
                           metric="either", unlike=0.3, limit=4000.0), shrink=2),
-            Practice("3 or 4 robots, 4 to 7 targets, blocked",
+            Practice("3 robots, 4 to 7 targets, blocked",
                      Draw(agents=(3, 3), targets=(4, 7), num_skills=2, unlike=0.3,
                           limit=4000.0), grounds=2048, shrink=2),
-            Practice("4 to 6 robots, 8 to 12 targets",
-                     Draw(agents=(4, 6), targets=(8, 12), sides=(16, 40), metric="either",
-                          unlike=0.3, limit=4000.0), shrink=4),
+            Practice("4 to 8 robots, 3 to 10 targets, 3 skills",
+                     Draw(agents=(4, 8), targets=(3, 10), num_skills=3, sides=(16, 48),
+                          metric="either", unlike=0.3, limit=4000.0), shrink=4),
+            Practice("2 to 6 robots, 8 to 14 targets",
+                     Draw(agents=(2, 6), targets=(8, 14), sides=(16, 48), metric="either",
+                          unlike=0.3, limit=4000.0), shrink=8),
             Practice("5 to 8 robots, 12 to 24 targets",
                      Draw(agents=(5, 8), targets=(12, 24), num_skills=3, metric="either",
-                          unlike=0.3, limit=8000.0), shrink=8),
+                          unlike=0.3, limit=8000.0), shrink=32),
             Practice("6 to 8 robots, 24 to 40 targets",
                      Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
-                          limit=8000.0), shrink=16),
-        ), rounds=320, hyper=replace(HYPER, spread=True), chunk_rounds=2, eval_every=5),
+                          limit=8000.0), shrink=64),
+        ), rounds=240, hyper=replace(HYPER, spread=True), chunk_rounds=2, eval_every=5),
 }

@@ -20,7 +20,8 @@ from moonteam.policies.policy import Policy
 from training.mappo.held_out import HELD_OUT_SEED
 from training.mappo.macro import grounds
 from training.mappo.macro.config import Practice
-from training.mappo.macro.update import Hyper, fresh
+from training.mappo.macro.hyper import Hyper
+from training.mappo.macro.update import fresh
 
 EXACT_TO = 8
 """Targets up to which the optimum is certified; beyond, it is the best that search finds."""

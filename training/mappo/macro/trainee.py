@@ -10,16 +10,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from moonteam.policies import pointer
 from moonteam.policies.brain import PointerBrain
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import PolicyFile
 from training.mappo.macro import grounds
-from training.mappo.macro.config import MacroConfig
+from training.mappo.macro.config import MacroConfig, Practice
 from training.mappo.macro.curve import draw_curve
 from training.mappo.macro.held_out import HeldOut
-from training.mappo.macro.update import Learner, Report, Walk, fresh, update
+from training.mappo.macro.learner import Learner
+from training.mappo.macro.update import Report, Walk, fresh, update
+from training.mappo.macro.vine import Grown, improve
 from training.run.families import mean
 from training.run.trainee import Made, Position, Row
 from training.sharding import everywhere, gather, mesh_for, spread
@@ -33,7 +36,7 @@ class Held(NamedTuple):
     """All that a resumed run needs; what is drawn descends from seed and round."""
 
     learner: Learner
-    walks: list[Walk]
+    walks: list[Walk | None]  # of those whose advantages are the critic's
 
 
 class MacroMappo:
@@ -45,8 +48,12 @@ class MacroMappo:
         """Makes grounds and environments from the config's seed, parameters too if not given."""
         self.config, self.name, self.seed, self.source = config, config.macro, config.seed, source
         parts = config.hyper.minibatches
-        self.mesh = mesh_for([config.envs(f) for f in config.families]
-                             + [config.rows(f) // parts for f in config.families])
+        met = [f for f in config.families if f.advantages == "critic"]
+        grown = [config.grown(f) for f in config.families if f.advantages == "vine"]
+        self.mesh = mesh_for([config.envs(f) for f in met]
+                             + [config.rows(f) // parts for f in met]
+                             + [v.moments // v.minibatches for v in grown]
+                             + [v.episodes for v in grown])
         key = jax.random.key(config.seed)
         keys = jax.random.split(key, len(config.families) + 1)
         params = pointer.init(config.spec, keys[0]) if params is None else params
@@ -55,7 +62,7 @@ class MacroMappo:
                         if f.grounds else None for i, f in enumerate(config.families)]
         self.walks = [
             spread(self.mesh, jax.jit(partial(fresh, f.draw, config.hyper, count=config.envs(f)))(
-                ground, k))
+                ground, k)) if f.advantages == "critic" else None
             for f, ground, k in zip(config.families, self.grounds, keys[1:], strict=True)]
 
     @property
@@ -96,11 +103,22 @@ class MacroMappo:
                 key = jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
                                          number * len(config.families) + i)
                 with jax.default_matmul_precision(PRECISION[config.precision]):
-                    self.learner, self.walks[i], report = update(
-                        self.mesh, config.spec, family.draw, config.hyper, self.grounds[i],
-                        self.learner, self.walks[i], key, lr, entropy)
-                reports.append(report)
+                    reports.append(self._round(i, family, key, lr, entropy))
         return Made(count, count * config.decisions, _summary(gather(reports)))
+
+    def _round(self, i: int, family: Practice, key: Array, lr: np.float32,
+               entropy: np.float32) -> Report | Grown:
+        """One update on a family."""
+        config, walk = self.config, self.walks[i]
+        if walk is None:
+            self.learner, grown = improve(
+                self.mesh, config.spec, family.draw, config.hyper, config.grown(family),
+                self.grounds[i], self.learner, key, lr)
+            return grown
+        self.learner, self.walks[i], report = update(
+            self.mesh, config.spec, family.draw, config.hyper, self.grounds[i], self.learner,
+            walk, key, lr, entropy)
+        return report
 
     @cached_property
     def scenarios(self) -> list[HeldOut]:
@@ -141,7 +159,8 @@ class MacroMappo:
     def restore(self, phase: str, state: Held) -> None:
         """Spreads it over the devices."""
         self.learner = everywhere(self.mesh, Learner(*state.learner))
-        self.walks = [spread(self.mesh, Walk(*walk)) for walk in state.walks]
+        self.walks = [None if walk is None else spread(self.mesh, Walk(*walk))
+                      for walk in state.walks]
 
     def score(self, row: Row) -> float | None:
         """Mean success over the families, less the mean gap: both count."""
@@ -159,7 +178,7 @@ class MacroMappo:
     def words(self, rows: list[Row]) -> str:
         """Where it is, and how it did when last looked at."""
         row, look = rows[-1], next(r for r in reversed(rows) if "families" in r)
-        return (f"round {row['update']:,} of {self.config.rounds:,}, {row['rate']:,.0f} decisions/s"
+        return (f"round {row['update']:,} of {self.config.rounds:,}, {row['rate']:,.0f} moments/s"
                 f", entropy {row['entropy']:.2f}, critic error {row['value_loss']:.3f}\n"
                 f"held out {mean(look, 'success'):.3f} success, {mean(look, 'makespan_gap'):.1%} "
                 "over the optimum")
@@ -184,12 +203,8 @@ class MacroMappo:
         draw_curve(path, {self.name: [rows]})
 
 
-
-def _summary(reports: list[Report]) -> dict[str, float]:
-    """Means over a chunk's updates, of episodes weighed by how many ended."""
-    whole = {name: np.array([getattr(report, name) for report in reports])
-             for name in Report._fields}
-    weight = np.maximum(whole["episodes"], 1)
-    row = {"success": float(np.average(whole["success"], weights=weight)),
-           "episode_seconds": float(np.average(whole["seconds"], weights=weight))}
-    return row | {name: float(whole[name].mean()) for name in ("entropy", "value_loss", "clipped")}
+def _summary(reports: list[Report | Grown]) -> dict[str, float]:
+    """Means over a chunk's updates, of each figure over those that have it."""
+    names = sorted({name for report in reports for name in report._fields} - {"episodes"})
+    return {name: float(np.mean([getattr(report, name) for report in reports
+                                 if name in report._fields])) for name in names}

@@ -20,19 +20,21 @@ from tests.training.killed import kill_when_saved
 from training.mappo.macro import grounds
 from training.mappo.macro.config import PRESETS, MacroConfig, Practice
 from training.mappo.macro.held_out import HeldOut, moment_of
+from training.mappo.macro.hyper import Hyper, Vine
 from training.mappo.macro.trainee import MacroMappo
-from training.mappo.macro.update import Batch, Hyper, chosen, collect, fresh, loss
+from training.mappo.macro.update import Batch, chosen, collect, fresh, loss
 from training.run import checkpoints, metrics
 from training.run.trainee import Position
 
 SPEC = PointerSpec(width=16, heads=2, layers=1, pairs=8)
 SMALL = Draw(agents=(2, 2), targets=(2, 2), sides=(6, 6), limit=60.0)
 HYPER = Hyper(num_steps=4, learned=0.5, minibatches=2)
-TINY = MacroConfig("quick", (Practice("small", SMALL),), rounds=3, num_envs=8, hyper=HYPER,
-                   spec=SPEC, chunk_rounds=1, eval_every=1, eval_scenarios=32)
+VINE = Vine(episodes=8, num_steps=4, moments=16, minibatches=2)
+TINY = MacroConfig("quick", (Practice("small", SMALL, advantages="critic"),), rounds=3, num_envs=8,
+                   hyper=HYPER, vine=VINE, spec=SPEC, chunk_rounds=1, eval_every=1,
+                   eval_scenarios=32)
 BOTH = dataclasses.replace(
-    TINY, families=(Practice("small", SMALL), Practice("closed", SMALL, grounds=8, shrink=2)),
-    rounds=6, hyper=dataclasses.replace(HYPER, spread=True))
+    TINY, families=(*TINY.families, Practice("closed", SMALL, grounds=8, shrink=2)), rounds=6, hyper=dataclasses.replace(HYPER, spread=True))
 SMALLER = ("from training.mappo.macro import config; "
            "from tests.training.mappo.macro.test_macro import BOTH; "
            "config.PRESETS['quick'] = BOTH; ")
@@ -124,17 +126,21 @@ def test_a_better_choice_becomes_likelier(trainee, flat):
     params = trainee.learner.params
     batch = Batch(flat.view, flat.choice, flat.options, flat.log_prob,
                   jnp.ones(len(flat.value)), flat.value)
-    slope = jax.jit(jax.grad(lambda p: loss(p, SPEC, HYPER, batch, jnp.zeros(()))[0]))(params)
+    real = np.asarray(flat.options.sum(-1)) > 1
+    slope = jax.jit(jax.grad(lambda p: loss(p, SPEC, HYPER, batch, jnp.zeros(()),
+                                            jnp.float32(real.sum()), len(flat.value))[0]))(params)
     params = jax.tree.map(lambda p, g: p - 1e-2 * g, params, slope)
     after, _ = chosen(POINT(params, flat.view).logits, flat.options, flat.choice)
-    real = np.asarray(flat.options.sum(-1)) > 1
     assert np.asarray(after)[real].mean() > np.asarray(flat.log_prob)[real].mean()
 
 
-def test_training_learns():
+@pytest.mark.parametrize("advantages", ["critic", "vine"])
+def test_training_learns(advantages):
     """A minute's worth of a toy: the held-out gap falls."""
-    config = dataclasses.replace(TINY, rounds=40, num_envs=64, chunk_rounds=40, lr=3e-3,
-                                 hyper=dataclasses.replace(HYPER, num_steps=8, minibatches=4))
+    config = dataclasses.replace(
+        TINY, families=(Practice("small", SMALL, advantages=advantages),), rounds=40, num_envs=64,
+        chunk_rounds=40, lr=3e-3, hyper=dataclasses.replace(HYPER, num_steps=8, minibatches=4),
+        vine=Vine(episodes=64, num_steps=6, moments=128, minibatches=4))
     trainee = MacroMappo(config)
     before = trainee.evaluate()[0]
     trainee.chunk(Position("macro"))
@@ -230,6 +236,10 @@ def test_impossible_numbers(tmp_path, capsys):
         dataclasses.replace(TINY, num_envs=7, hyper=dataclasses.replace(HYPER, minibatches=8))
     with pytest.raises(InputError, match="at least 1"):
         dataclasses.replace(TINY, rounds=0)
+    with pytest.raises(InputError, match="8 moments of closed are not divided by 5"):
+        dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, minibatches=10))
+    with pytest.raises(InputError, match="2 options"):
+        dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, options=1))
     assert main(["train", "quick", "--policy", "small", "--out", str(tmp_path / "x")]) == 2
     assert "only pointer policies" in capsys.readouterr().err
 
