@@ -89,7 +89,8 @@ def descend(learner: Learner, hyper: Hyper, loss: Callable[[Any, Any, Array], tu
             return jax.tree.map(jnp.add, sums, slope(part)), None
 
         parts = index.reshape(-1, size)
-        (way, said), _ = jax.lax.scan(add, slope(parts[0]), parts[1:])
+        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(slope, parts[0]))
+        (way, said), _ = jax.lax.scan(add, none, parts)
         way, state = rule.update(jax.lax.pmean(way, AXIS), learner.optimiser)
         params = jax.tree.map(lambda p, w: p - lr * w, learner.params, way)
         # Young, the mean must not remember how it began.

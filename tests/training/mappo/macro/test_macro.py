@@ -34,7 +34,8 @@ TINY = MacroConfig("quick", (Practice("small", SMALL, advantages="critic"),), ro
                    hyper=HYPER, vine=VINE, spec=SPEC, chunk_rounds=1, eval_every=1,
                    eval_scenarios=32)
 BOTH = dataclasses.replace(
-    TINY, families=(*TINY.families, Practice("closed", SMALL, grounds=8, shrink=2)), rounds=6, hyper=dataclasses.replace(HYPER, spread=True))
+    TINY, families=(*TINY.families, Practice("closed", SMALL, grounds=8, shrink=2)), rounds=6,
+    hyper=dataclasses.replace(HYPER, spread=True))
 SMALLER = ("from training.mappo.macro import config; "
            "from tests.training.mappo.macro.test_macro import BOTH; "
            "config.PRESETS['quick'] = BOTH; ")
