@@ -125,8 +125,8 @@ PAPER = Practice("3 robots, 5 to 7 targets", Draw())
 HYPER = Hyper(loose=0.2)
 
 PRESETS = {
-    "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER),
-    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER),
+    "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER, lr=2e-3),
+    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER, lr=2e-3),
     "any_team": MacroConfig(
         "any_team", (
             PAPER,
@@ -151,5 +151,8 @@ PRESETS = {
             Practice("6 to 8 robots, 24 to 40 targets",
                      Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
                           limit=8000.0), shrink=64),
-        ), rounds=240, hyper=replace(HYPER, spread=True), chunk_rounds=2, eval_every=5),
+        ),
+        # Of many targets returns are long, and their squared error would drown the choices.
+        rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), lr=2e-3,
+        chunk_rounds=2, eval_every=5),
 }

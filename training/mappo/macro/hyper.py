@@ -70,7 +70,7 @@ class Vine:
     """Weight of a moment beside the entropy of its choice, by which moments are drawn."""
     tau: float = 0.1
     """Weight of the divergence from the policy as it was, in units of time."""
-    minibatches: int = 8
+    minibatches: int = 16
     """Parts of a pass."""
     epochs: int = 2
     """Passes over the moments."""
