@@ -196,7 +196,7 @@ class MacroMappo:
         """A line a family."""
         return [*(f"{row['family']}: success {row['success']:.3f}, makespan "
                   f"{row['makespan_gap']:.1%} over the optimum" for row in report["families"]),
-                f"{report['env_steps']:,} decisions in {report['seconds']:.0f} s"]
+                f"{report['env_steps']:,} moments in {report['seconds']:.0f} s"]
 
     def draw_curve(self, path: Path, rows: list[Row]) -> None:
         """Success and gap over minutes."""
