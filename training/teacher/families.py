@@ -28,6 +28,7 @@ from training.sharding import everywhere, spread
 TIE_BREAK = 0.05
 """Weight that makespan and moves both keep at either end of the preference."""
 
+
 @dataclass(frozen=True)
 class Family:
     """Problems of one team and target count; maps of all sizes between two."""

@@ -248,16 +248,25 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
         log = log._replace(solved=result.terminated, served=after.solved | after.serving)
         at = jnp.where(over, pool.episode, rows * tries)
         done = jax.tree.map(lambda all_, own: all_.at[at].set(own, mode="drop"), pool.done, log)
-        taken = pool.following + jnp.cumsum(over) - 1
-        episode = jnp.where(over, taken, pool.episode).astype(jnp.int32)
+        episode, following = refilled(over, pool.episode, pool.following)
         log, after = trees.where(over, (blank(places), fresh(episode)), (log, after))
         return _Pool(episode, after, jnp.where(over, 0, pool.turn + 1), log, done,
-                     pool.following + jnp.sum(over, dtype=jnp.int32))
+                     following)
 
     everyone = jnp.arange(places, dtype=jnp.int32)
     begun = _Pool(everyone, fresh(everyone), jnp.zeros(places, jnp.int32), blank(places),
                   blank(rows * tries), jnp.int32(places))
     return jax.lax.while_loop(lambda pool: jnp.any(pool.episode < count), decide, begun).done
+
+
+def refilled(over: Array, held: Array, following: Array) -> tuple[Array, Array]:
+    """The numbers [E] that the places of a pool hold, where it is `over` [E] the next ones.
+
+    `held` [E] int32 is what they held; `following` [] int32 the next number, before and after.
+    """
+    taken = following + jnp.cumsum(over) - 1
+    return (jnp.where(over, taken, held).astype(jnp.int32),
+            following + jnp.sum(over, dtype=jnp.int32))
 
 
 def _written(log: _Done, state: MacroState, choice: Array, turn: Array) -> _Done:

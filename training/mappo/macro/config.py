@@ -45,7 +45,7 @@ class MacroConfig:
     """Of an update by branches."""
     spec: PointerSpec = field(default_factory=PointerSpec)
     """Size of the network."""
-    lr: float = 1e-3
+    lr: float = 2e-3
     """Learning rate at the start; falls linearly to a twentieth."""
     ent_coef: float = 0.01
     """Entropy bonus at the start; falls linearly to 0 at five sixths of the run."""
@@ -66,10 +66,17 @@ class MacroConfig:
             if getattr(self, key) < 1:
                 raise InputError(self.macro, f"{getattr(self, key)} is not allowed; at least 1",
                                  key)
-        for key in ("num_steps", "epochs", "minibatches"):
-            if getattr(self.hyper, key) < 1:
-                raise InputError(self.macro, f"{getattr(self.hyper, key)} is not allowed; at "
-                                 "least 1", f"hyper.{key}")
+        for name, keys in (("hyper", ("num_steps", "epochs", "minibatches", "part")),
+                           ("vine", ("episodes", "moments", "epochs", "minibatches", "longest"))):
+            for key in keys:
+                if (value := getattr(getattr(self, name), key)) < 1:
+                    raise InputError(self.macro, f"{value} is not allowed; at least 1",
+                                     f"{name}.{key}")
+        if self.vine.options < 2:
+            raise InputError(self.macro, f"{self.vine.options} is not allowed; at least 2 options",
+                             "vine.options")
+        if self.vine.tau <= 0.0:
+            raise InputError(self.macro, f"{self.vine.tau:g} is not allowed; above 0", "vine.tau")
         if not 0.0 < self.lr <= 0.1:
             raise InputError(self.macro, f"{self.lr:g} is not allowed; above 0, at most 0.1", "lr")
         if not 0.0 < self.hyper.learned <= 1.0:
@@ -87,14 +94,14 @@ class MacroConfig:
                     f"{self.hyper.num_steps} decisions of {one.name}", "hyper.minibatches")
 
     def _check(self, family: Practice) -> None:
+        """Of a family that is branched."""
         vine = self.grown(family)
-        if min(vine.episodes, vine.moments, vine.options - 1, vine.epochs, vine.num_steps) < 1:
-            raise InputError(self.macro, f"{vine} of {family.name} is not allowed; at least 1 of "
-                             "each, and 2 options", "vine")
-        if vine.moments % vine.minibatches or vine.moments > vine.episodes * vine.num_steps:
+        if vine.moments < 1 or vine.moments % vine.minibatches or (
+                vine.moments > vine.episodes * vine.num_steps):
             raise InputError(self.macro, f"{vine.moments} moments of {family.name} are not "
-                             f"divided by {vine.minibatches} minibatches, or are more than its "
-                             f"{vine.episodes} x {vine.num_steps} decisions", "vine.moments")
+                             f"divided by {vine.minibatches} minibatches, are more than its "
+                             f"{vine.episodes} x {vine.num_steps} decisions, or none",
+                             "vine.moments")
 
     def grown(self, family: Practice) -> Vine:
         """Of a family: fewer moments of large problems, in fewer minibatches of the same size."""
@@ -125,8 +132,8 @@ PAPER = Practice("3 robots, 5 to 7 targets", Draw())
 HYPER = Hyper(loose=0.2)
 
 PRESETS = {
-    "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER, lr=2e-3),
-    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER, lr=2e-3),
+    "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER),
+    "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER),
     "any_team": MacroConfig(
         "any_team", (
             PAPER,
@@ -152,7 +159,6 @@ PRESETS = {
                      Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
                           limit=8000.0), shrink=64),
         ),
-        # Of many targets returns are long, and their squared error would drown the choices.
-        rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), lr=2e-3,
-        chunk_rounds=2, eval_every=5),
+        # Of many targets returns are long, and their squared error could drown the choices.
+        rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5),
 }

@@ -19,6 +19,7 @@ from training.mappo.macro.hyper import Hyper
 AXIS = "batch"
 """Of the mesh, see `training.sharding`."""
 
+
 class Learner(NamedTuple):
     """What learning changes."""
 
@@ -57,8 +58,7 @@ def say(params: Any, spec: PointerSpec, hyper: Hyper, view: Outlook) -> Pointed:
 
 
 def descend(learner: Learner, hyper: Hyper, loss: Callable[[Any, Any, Array], tuple[Array, Array]],
-            rows: Any, view: Outlook, real: Array, order: Array,
-            lr: Array) -> tuple[Learner, Array]:
+            rows: Any, real: Array, order: Array, lr: Array) -> tuple[Learner, Array]:
     """One gradient step for every row of `order`, on the device's own rows; gradients are shared.
 
     Args:
@@ -66,8 +66,7 @@ def descend(learner: Learner, hyper: Hyper, loss: Callable[[Any, Any, Array], tu
       hyper: its clip, mean and part.
       loss: of parameters, rows and the number of choices that it is to divide by: a sum over the
         rows, and figures of the same kind.
-      rows: [S, ...] all of them.
-      view: [S, ...] what the network saw in them.
+      rows: [S, ...] all of them; `rows.view` is what the network saw.
       real: [S] choices that a row has.
       order: [steps, B] indices of the rows of each minibatch.
       lr: learning rate.
@@ -76,7 +75,7 @@ def descend(learner: Learner, hyper: Hyper, loss: Callable[[Any, Any, Array], tu
       The learner after, and the figures [steps, ...].
     """
     rule = _optimiser(hyper)
-    size = part_of(order.shape[1], hyper.rows(view))
+    size = part_of(order.shape[1], hyper.rows(rows.view))
 
     def step(learner: Learner, index: Array) -> tuple[Learner, Array]:
         count = jnp.maximum(jnp.sum(real[index]), 1)
@@ -85,12 +84,8 @@ def descend(learner: Learner, hyper: Hyper, loss: Callable[[Any, Any, Array], tu
             own = jax.tree.map(lambda x: x[part], rows)
             return jax.grad(loss, has_aux=True)(learner.params, own, count)
 
-        def add(sums: Any, part: Array) -> tuple[Any, None]:
-            return jax.tree.map(jnp.add, sums, slope(part)), None
-
-        parts = index.reshape(-1, size)
-        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(slope, parts[0]))
-        (way, said), _ = jax.lax.scan(add, none, parts)
+        way, said = jax.tree.map(lambda x: jnp.sum(x, axis=0),
+                                 jax.lax.map(slope, index.reshape(-1, size)))
         way, state = rule.update(jax.lax.pmean(way, AXIS), learner.optimiser)
         params = jax.tree.map(lambda p, w: p - lr * w, learner.params, way)
         # Young, the mean must not remember how it began.

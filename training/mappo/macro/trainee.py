@@ -204,7 +204,15 @@ class MacroMappo:
 
 
 def _summary(reports: list[Report | Grown]) -> dict[str, float]:
-    """Means over a chunk's updates, of each figure over those that have it."""
-    names = sorted({name for report in reports for name in report._fields} - {"episodes"})
-    return {name: float(np.mean([getattr(report, name) for report in reports
-                                 if name in report._fields])) for name in names}
+    """Means over a chunk's updates, each figure over those that have it.
+
+    What is known of episodes or branches is weighed by how many there were.
+    """
+    def figure(name: str) -> float:
+        own = [report for report in reports if name in report._fields]
+        weights = ([max(float(report.episodes), 1.0) for report in own]
+                   if name in ("success", "episode_seconds") else None)
+        return float(np.average([getattr(report, name) for report in own], weights=weights))
+
+    names = {name for report in reports for name in report._fields} - {"episodes"}
+    return {name: figure(name) for name in sorted(names)}

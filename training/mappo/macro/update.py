@@ -52,7 +52,7 @@ class Report(NamedTuple):
     """Of one update."""
 
     success: Array
-    seconds: Array  # mean length of the episodes that ended
+    episode_seconds: Array  # mean length of the episodes that ended
     entropy: Array
     value_loss: Array
     clipped: Array
@@ -79,12 +79,16 @@ def fresh(family: Draw, hyper: Hyper, ground: MacroProblem | None, key: Array,
     return Walk(states, prefer)
 
 
+def among(logits: Array, options: Array) -> tuple[Array, Array]:
+    """Log-probabilities [..., M + 1] of the options, far below of what is none; entropy [...]."""
+    log_probs = jax.nn.log_softmax(jnp.where(options, logits, -FAR), axis=-1)
+    return log_probs, -jnp.sum(jnp.where(options, jnp.exp(log_probs) * log_probs, 0.0), axis=-1)
+
+
 def chosen(logits: Array, options: Array, choice: Array) -> tuple[Array, Array]:
     """Log-probability [..., N] of the choices among the options, and entropy [..., N]."""
-    log_probs = jax.nn.log_softmax(jnp.where(options, logits, -FAR), axis=-1)
-    taken = jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0]
-    entropy = -jnp.sum(jnp.where(options, jnp.exp(log_probs) * log_probs, 0.0), axis=-1)
-    return taken, entropy
+    log_probs, entropy = among(logits, options)
+    return jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0], entropy
 
 
 def turned(result: MacroResult, who: Array) -> tuple[MacroState, Array]:
@@ -201,8 +205,7 @@ def _on_each(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem
     def part_loss(params: Any, part: Batch, count: Array) -> tuple[Array, Array]:
         return loss(params, spec, hyper, part, entropy_weight, count, rows_in_order.shape[1])
 
-    learner, said = descend(learner, hyper, part_loss, flat, flat.view, choices,
-                            rows_in_order, lr)
+    learner, said = descend(learner, hyper, part_loss, flat, choices, rows_in_order, lr)
     episodes, solved, length = jax.lax.psum(
         (jnp.sum(rows.ended), jnp.sum(rows.ended & ~rows.truncated), jnp.sum(lengths)), AXIS)
     count = jnp.maximum(episodes, 1)

@@ -26,10 +26,11 @@ from moonteam import trees
 from moonteam.grid.macro import world
 from moonteam.grid.macro.draw import Draw
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
+from moonteam.planners.macro import refilled
 from moonteam.policies.pointer import Outlook, PointerSpec, look, point
 from training.mappo.macro.hyper import Hyper, Vine
 from training.mappo.macro.learner import AXIS, Learner, descend, say
-from training.mappo.macro.update import fresh, price, turned
+from training.mappo.macro.update import among, fresh, price, turned
 
 
 class Moments(NamedTuple):
@@ -41,6 +42,7 @@ class Moments(NamedTuple):
     who: Array  # [S] int32, the agent that tries
     options: Array  # [S, M + 1] bool, what it can choose from at its turn
     log_probs: Array  # [S, M + 1] the policy's, among them
+    entropy: Array  # [S]
     choice: Array  # [S] int32, its likeliest
     real: Array  # [S] bool; False fills up where there were too few
 
@@ -63,6 +65,7 @@ class Grown(NamedTuple):
     entropy: Array
     value_loss: Array
     regret: Array  # mean of the best tried over the likeliest, in units
+    episodes: Array  # branches played
 
 
 class _Pool(NamedTuple):
@@ -96,15 +99,14 @@ def met(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine, ground: Macro
     states, logits, live = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     # What others choose beside the branch is their likeliest.
     choice, options = jax.vmap(world.choose)(states, logits, jnp.zeros_like(logits))
-    log_probs = jax.nn.log_softmax(jnp.where(options, logits, -FAR), axis=-1)
-    spread = jnp.sum(jax.scipy.special.entr(jnp.exp(log_probs)), axis=-1)
+    log_probs, spread = among(logits, options)
     real = (jnp.sum(options, axis=-1) > 1) & live[:, None]  # [I * T, N]
     weight = jnp.log(jnp.where(real, spread + vine.floor, 0.0))
     most = jax.nn.logsumexp(weight, axis=-1) + jax.random.gumbel(pick_key, live.shape)
     pick = jnp.argsort(-most)[:vine.moments]
     drawn = weight[pick] + jax.random.gumbel(who_key, weight[pick].shape)
     who = jnp.argmax(drawn, axis=-1).astype(jnp.int32)
-    chosen = jax.tree.map(lambda x: x[pick, who], (options, log_probs, choice))
+    chosen = jax.tree.map(lambda x: x[pick, who], (options, log_probs, spread, choice))
     states, liking = jax.tree.map(lambda x: x[pick],
                                   (states, jnp.tile(walk.preference, vine.num_steps)))
     return Moments(states, jax.vmap(look)(states, liking), liking, who, *chosen,
@@ -153,13 +155,11 @@ def tried(spec: PointerSpec, hyper: Hyper, vine: Vine, params: Any, moments: Mom
         total = pool.sum - paid - hyper.failure * left
         over = ended & (pool.branch < count)
         put = jnp.where(over, spot, size * k)
-        branch = jnp.where(over, pool.following + jnp.cumsum(over) - 1, pool.branch)
-        branch = branch.astype(jnp.int32)
+        branch, following = refilled(over, pool.branch, pool.following)
         return _Pool(branch, trees.where(over, begun(branch), after),
                      jnp.where(over, 0, pool.turn + 1), jnp.where(over, 0.0, total),
                      pool.value.at[put].set(total, mode="drop"),
-                     pool.solved.at[put].set(result.terminated, mode="drop"),
-                     pool.following + jnp.sum(over, dtype=jnp.int32))
+                     pool.solved.at[put].set(result.terminated, mode="drop"), following)
 
     first = jnp.arange(places, dtype=jnp.int32)
     start = _Pool(first, begun(first), jnp.zeros(places, jnp.int32), jnp.zeros(places),
@@ -188,7 +188,7 @@ def aim(vine: Vine, log_probs: Array, option: Array, valid: Array, value: Array)
 
 def grow(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine, ground: MacroProblem | None,
          params: Any, key: Array) -> tuple[Branch, Array]:
-    """Moments with what to move to; and share of branches solved, entropy, regret."""
+    """Moments with what to move to; and branches played, those of them solved, entropy, regret."""
     met_key, other = jax.random.split(key)
     moments = met(spec, family, hyper, vine, ground, params, met_key)
     drawn = moments.log_probs + vine.wide * jax.random.gumbel(other, moments.log_probs.shape)
@@ -203,10 +203,9 @@ def grow(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine, ground: Macr
         return jnp.sum(jnp.where(moments.real, x, 0.0)) / jnp.maximum(jnp.sum(moments.real), 1)
 
     best = jnp.max(jnp.where(valid, value, -FAR), axis=1)
-    spread = jnp.sum(jax.scipy.special.entr(jnp.exp(moments.log_probs)), axis=-1)
-    share = jnp.sum(solved) / jnp.maximum(jnp.sum(valid), 1)
     branch = Branch(moments.view, moments.who, moments.options, goal, value[:, 0], moments.real)
-    return branch, jnp.stack([share, mean(spread), mean(best - value[:, 0])])
+    return branch, jnp.stack([jnp.sum(valid), jnp.sum(solved), mean(moments.entropy),
+                              mean(best - value[:, 0])])
 
 
 def loss(params: Any, spec: PointerSpec, hyper: Hyper, rows: Branch,
@@ -217,7 +216,7 @@ def loss(params: Any, spec: PointerSpec, hyper: Hyper, rows: Branch,
     """
     said = point(params, spec, rows.view)
     own = jnp.take_along_axis(said.logits, rows.who[:, None, None], axis=1)[:, 0]
-    log_probs = jax.nn.log_softmax(jnp.where(rows.options, own, -FAR), axis=-1)
+    log_probs, _ = among(own, rows.options)
     told = jnp.where(rows.options & rows.real[:, None], rows.goal * log_probs, 0.0)
     off = jnp.where(rows.real, said.value - rows.value, 0.0)
     critic = 0.5 * jnp.sum(off**2) / count
@@ -236,10 +235,11 @@ def _on_each(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine,
     def part_loss(params: Any, part: Branch, count: Array) -> tuple[Array, Array]:
         return loss(params, spec, hyper, part, count)
 
-    learner, critic = descend(learner, hyper, part_loss, rows, rows.view, rows.real,
+    learner, critic = descend(learner, hyper, part_loss, rows, rows.real,
                               order.reshape(vine.epochs * vine.minibatches, -1), lr)
-    success, entropy, regret, error = jax.lax.pmean((*said, critic.mean()), AXIS)
-    return learner, Grown(success, entropy, error, regret)
+    played, solved = jax.lax.psum((said[0], said[1]), AXIS)
+    entropy, regret, error = jax.lax.pmean((said[2], said[3], critic.mean()), AXIS)
+    return learner, Grown(solved / jnp.maximum(played, 1), entropy, error, regret, played)
 
 
 @partial(jax.jit, static_argnames=("mesh", "spec", "family", "hyper", "vine"),

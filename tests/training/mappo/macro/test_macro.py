@@ -144,7 +144,9 @@ def test_training_learns(advantages):
         vine=Vine(episodes=64, num_steps=6, moments=128, minibatches=4))
     trainee = MacroMappo(config)
     before = trainee.evaluate()[0]
-    trainee.chunk(Position("macro"))
+    figures = trainee.chunk(Position("macro")).figures
+    assert 0.0 < figures["success"] <= 1.0
+    assert not figures.keys() & {f.name for f in dataclasses.fields(Position)}  # of the same row
     after = trainee.evaluate()[0]
     assert after["success"] == 1.0
     assert after["makespan_gap"] < before["makespan_gap"]
@@ -239,6 +241,11 @@ def test_impossible_numbers(tmp_path, capsys):
         dataclasses.replace(TINY, rounds=0)
     with pytest.raises(InputError, match="8 moments of closed are not divided by 5"):
         dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, minibatches=10))
+    with pytest.raises(InputError, match="0 moments of closed"):
+        dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, moments=1))
+    for key, value in (("tau", 0.0), ("minibatches", 0), ("episodes", 0)):
+        with pytest.raises(InputError, match=rf"vine\.{key}: 0 is not allowed"):
+            dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, **{key: value}))
     with pytest.raises(InputError, match="2 options"):
         dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, options=1))
     assert main(["train", "quick", "--policy", "small", "--out", str(tmp_path / "x")]) == 2
