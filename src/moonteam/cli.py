@@ -2,12 +2,14 @@
 
 A command module holds `Args`, a frozen dataclass whose docstring is the help text and
 whose fields tyro reads, and `run(args) -> int`, which returns the exit code.
-Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 interrupted.
+Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 interrupted, 141
+whoever read the output (`| head`) went away.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from typing import Any
 
@@ -89,22 +91,32 @@ def parse(name: str, words: list[str]) -> Any:
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
-    if not words or words[0] in ("-h", "--help", "help"):
-        print(usage())
-        return 0 if words else 2
-    if words[0] == "--version":
-        print(__version__)
-        return 0
     try:
-        name, rest = find_command(words)
-        module = importlib.import_module(COMMANDS[name][0])
-        return module.run(parse(name, rest))
+        code = _run(words)
+        sys.stdout.flush()  # here, where a reader that went away is still caught
+        return code
     except InputError as error:
         print(f"moonteam: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("moonteam: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        # What is still in the buffer has no reader: Python must not try to write it at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if words else 2
+    if words[0] == "--version":
+        print(__version__)
+        return 0
+    name, rest = find_command(words)
+    module = importlib.import_module(COMMANDS[name][0])
+    return module.run(parse(name, rest))
 
 
 if __name__ == "__main__":
