@@ -147,7 +147,7 @@ def carry_out(args: Args) -> Done:
         check_display()
     made = _from_file(args) if args.report is None else _from_report(args)
     mission = made.prepared.mission
-    out = args.out or Path("runs") / mission.name
+    out = args.out or Path("runs") / files.safe_name(mission.name, "mission")
     _make_folder(out, args, made.prepared.written)
     interrupted = False
     try:

@@ -48,9 +48,8 @@ class Journal(Generic[Entry]):
         """The whole entries; half a line at the end is left out."""
         found = []
         text = files.read_text(self._path) if self._path.exists() else ""
-        for number, line in enumerate(text.splitlines(keepends=True), 1):
-            if not line.endswith("\n"):
-                break
+        whole, _, _ = text.rpartition("\n")
+        for number, line in enumerate(files.lines(whole) if whole else [], 1):
             try:
                 found.append(msgspec.json.decode(line, type=kind))
             except msgspec.DecodeError as error:

@@ -85,7 +85,8 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
     if isinstance(mission, Mission):
         import yaml
 
-        folder = Path(out) if out is not None else Path("runs") / (mission.name or "mission")
+        name = files.safe_name(mission.name, "mission")
+        folder = Path(out) if out is not None else Path("runs") / name
         file = folder / "mission.yaml"
         files.write_text(file, yaml.safe_dump(msgspec.to_builtins(mission), sort_keys=False))
     else:

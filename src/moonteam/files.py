@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from moonteam.errors import InputError
+from moonteam.strict import json_value
 
 T = TypeVar("T")
 
@@ -19,7 +21,7 @@ T = TypeVar("T")
 def read_text(path: str | os.PathLike[str]) -> str:
     """The file's text. Raises InputError if it is missing, unreadable or not UTF-8."""
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")  # a byte-order mark is no text
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
     except IsADirectoryError:
@@ -118,11 +120,21 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 def read_json(path: str | os.PathLike[str], kind: Any = Any) -> Any:
     """The value of a JSON file, checked against a type. Raises InputError."""
-    try:
-        value = msgspec.json.decode(read_text(path))
-    except msgspec.DecodeError as error:
-        raise InputError(path, f"is not JSON: {error}") from None
-    return convert(value, kind, path)
+    return convert(json_value(read_text(path), path), kind, path)
+
+
+def lines(text: str) -> list[str]:
+    """Lines of a `.jsonl` text. JSON's strings may hold what `str.splitlines` takes for an end."""
+    return text.removesuffix("\n").split("\n")
+
+
+def safe_name(name: str, otherwise: str) -> str:
+    """A name as a file or folder may have it, in one part; `otherwise` if nothing is left.
+
+    Letters and digits of any language, dots, hyphens and underlines stay; the rest is a hyphen.
+    """
+    plain = re.sub(r"[^\w.-]+", "-", name).strip(".-")
+    return plain[:100] or otherwise
 
 
 def read_lines(path: str | os.PathLike[str], decode: Callable[[str, str], T], what: str
@@ -132,7 +144,7 @@ def read_lines(path: str | os.PathLike[str], decode: Callable[[str, str], T], wh
     Raises InputError if there is none, `what` being what is missing.
     """
     found = [decode(line, f"line {n}")
-             for n, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
+             for n, line in enumerate(lines(read_text(path)), 1) if line.strip()]
     if not found:
         raise InputError(path, f"holds no {what}; one JSON object a line is needed")
     return found

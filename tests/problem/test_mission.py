@@ -64,7 +64,7 @@ BAD = {
     "no robots": (GOOD[GOOD.index("robots:"):GOOD.index("targets:")], "robots: []\n",
                   "robots: at least one"),
     "no steps": ("max_steps: 50", "max_steps: 0", "max_steps: 0 is not allowed; at least 1"),
-    "cell size": ("cell_m: 1.5", "cell_m: .nan", "map.cell_m: nan is not allowed"),
+    "cell size": ("cell_m: 1.5", "cell_m: .nan", "'.nan' is no finite number (line"),
     "two sites": ("preset: mare", "preset: mare, dem: a.tif", "site: give one of preset and dem"),
     "event of nobody": ("lost: flyer", "lost: yutu", "events[0].lost: no robot is named 'yutu'"),
     "event's skill nobody has": ("lost: flyer", "target: {at: [2, 2], skills: [drill]}",

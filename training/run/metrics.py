@@ -79,7 +79,7 @@ def scalars(row: dict[Any, Any], prefix: str = "") -> dict[str, float]:
 def read(path: Path) -> list[Row]:
     """The rows of a metrics file; a half-written last line is left out."""
     rows = []
-    for line in files.read_text(path).splitlines() if path.exists() else []:
+    for line in files.lines(files.read_text(path)) if path.exists() else []:
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:

@@ -15,6 +15,7 @@ from moonteam.commands.options import Printed, Saved
 from moonteam.errors import InputError
 from moonteam.problem import scenario
 from moonteam.problem.scenario import ACTIONS, Scenario
+from moonteam.strict import json_value
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,7 @@ def read_actions(source: str, num_agents: int, max_steps: int) -> list[list[int]
     """The joint actions of a file or of standard input, as numbers [T][N]. Raises InputError."""
     label = "standard input" if source == "-" else source
     text = sys.stdin.read() if source == "-" else files.read_text(source)
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        raise InputError(label, f"not JSON: {error.msg} ({where})") from None
+    value = json_value(text, label)
     if isinstance(value, dict):
         if "actions" not in value:
             raise InputError(label, 'an object needs the key "actions"')

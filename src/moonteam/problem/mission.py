@@ -10,12 +10,12 @@ import os
 from typing import Literal
 
 import msgspec
-import yaml
 
 from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem import scenario, timed
 from moonteam.problem.scenario import Cell
+from moonteam.strict import yaml_value
 
 WHAT = ("lost", "target", "slow", "silent", "impassable")
 """Keys of an event, one of which says what happens."""
@@ -172,27 +172,9 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         )
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML that refuses a key given twice: the first would be lost without a word."""
-
-    def construct_mapping(self, node, deep=False):
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key, (where, _) in zip(keys, node.value, strict=True):
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key!r} is given twice", where.start_mark)
-        return super().construct_mapping(node, deep)
-
-
 def load(path: str | os.PathLike[str]) -> Mission:
     """Reads and checks a mission file. Raises InputError naming file, key and what is allowed."""
-    text = files.read_text(path)
-    try:
-        value = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" (line {mark.line + 1})" if mark else ""
-        raise InputError(path, f"not YAML: {getattr(error, 'problem', error)}{where}") from None
+    value = yaml_value(files.read_text(path), path)
     if value is None:
         raise InputError(path, "is empty; keys map, robots and targets are needed")
     if not isinstance(value, dict):

@@ -5,7 +5,6 @@ This module knows neither wing. Cells are (x, y): x right, y up, origin lower le
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,6 +14,7 @@ import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError
+from moonteam.strict import json_value
 
 ACTIONS = ("up", "down", "left", "right", "stay")
 """The paper's order: 0 up (+y), 1 down (-y), 2 left (-x), 3 right (+x), 4 stay."""
@@ -138,10 +138,7 @@ def missing_skills(scenario: Scenario) -> dict[int, list[str]]:
 
 
 def _decode(text: str, source: object, where: str = "") -> Scenario:
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(source, f"not JSON: {error.msg} (column {error.colno})", where) from None
+    value = json_value(text, source, where)
     return check(files.convert(value, Scenario, source, where), source, where)
 
 

@@ -21,6 +21,7 @@ import msgspec
 from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem.scenario import MAX_SKILLS, Scenario
+from moonteam.strict import json_value
 
 Place = tuple[float, float]
 Metric = Literal["straight", "manhattan"]
@@ -198,7 +199,7 @@ def load(path: str | os.PathLike[str]) -> Timed:
 def load_set(path: str | os.PathLike[str]) -> list[Timed]:
     """A `.jsonl` set, one problem a line. Raises InputError naming the line."""
     return files.read_lines(
-        path, lambda line, where: convert(_decode(line, path, where), path, where), "problem")
+        path, lambda line, where: convert(json_value(line, path, where), path, where), "problem")
 
 
 def save_set(path: str | os.PathLike[str], problems: Iterable[Timed]) -> None:
@@ -212,7 +213,7 @@ def by_the_clock(path: str | os.PathLike[str]) -> bool:
     Lines that are no JSON say nothing. Raises InputError naming the line if a set holds both.
     """
     text = files.read_text(path)
-    lines = text.splitlines() if os.fspath(path).endswith(".jsonl") else [text]
+    lines = files.lines(text) if os.fspath(path).endswith(".jsonl") else [text]
     first: bool | None = None
     for n, line in enumerate(lines, 1):
         clocked = _clocked(line) if line.strip() else None
@@ -229,13 +230,6 @@ def by_the_clock(path: str | os.PathLike[str]) -> bool:
 def convert(value: Any, source: object, where: str = "") -> Timed:
     """What was read, checked. Raises InputError."""
     return check(files.convert(value, Timed, source, where), source, where)
-
-
-def _decode(line: str, source: object, where: str) -> Any:
-    try:
-        return msgspec.json.decode(line)
-    except msgspec.DecodeError as error:
-        raise InputError(source, f"not JSON: {error}", where) from None
 
 
 def _clocked(line: str) -> bool | None:
