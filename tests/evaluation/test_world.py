@@ -204,7 +204,8 @@ def test_temperature_is_part_of_the_decoding():
     assert parse("sample@0.25").temperature == 0.25
     assert parse("best-of-16@0.250").name == "best-of-16@0.25"
     assert parse("argmax@1.0") == parse("argmax")
-    assert parse("sample@0.5") == parse("sample")
+    assert parse("sample@0.5").temperature == parse("sample").temperature
+    assert parse("sample@0.5").name == "sample@0.5"  # usual for steps, not for targets
 
 
 def test_time_limits_make_rows():

@@ -61,7 +61,9 @@ def parse(text: str) -> Decode:
     sample = count is not None or how == "sample"
     usual = SAMPLING if sample else 1.0
     heat = usual if found["heat"] is None else _temperature(text, found["heat"])
-    name = how + ("" if heat == usual else f"@{heat:g}")
+    # Networks that choose targets draw at another usual temperature: what was asked is said.
+    same = found["heat"] is None or (heat == usual and not sample)
+    name = how + ("" if same else f"@{heat:g}")
     return Decode(name, sample, how == "argmax", rollouts, heat, text)
 
 

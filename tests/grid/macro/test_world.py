@@ -103,7 +103,11 @@ def test_who_turns_away_starts_where_it_is():
     for _ in range(5):
         start, spots = r.uniform(0, 20, (2, 2)), r.uniform(0, 20, (4, 2))
         apart = lambda a, b: np.linalg.norm(a[:, None] - b[None], axis=-1)
-        problem = team([[1, 0], [1, 0]], [[1, 0]] * 4, apart(start, spots), apart(spots, spots))
+        base, free = r.uniform(0, 20, (1, 2)), np.array([1.0, 0.0])  # the second need not return
+        home = free[:, None] * apart(base, spots)
+        problem = team([[1, 0], [1, 0]], [[1, 0]] * 4, apart(start, spots), apart(spots, spots),
+                       home=home.astype(np.float32),
+                       home_now=(free * apart(start, base)[:, 0]).astype(np.float32))
         state = step(reset(problem), jnp.array([0, 1])).state
         late = int(np.argmax(np.asarray(state.busy)))
         assert state.goal[late] == late
@@ -111,8 +115,11 @@ def test_who_turns_away_starts_where_it_is():
         point = start[late] + gone * (spots[late] - start[late])
         after = world.loosen(state, jnp.ones(2, bool))
         assert (after.goal[late], after.node[late], after.busy[late]) == (4, 4, 0.0)
+        assert after.since[late] == state.now
         np.testing.assert_allclose(after.problem.start[late], apart(point[None], spots)[0],
                                    atol=2e-3)
+        np.testing.assert_allclose(after.problem.home_now[late],
+                                   free[late] * apart(point[None], base)[0, 0], atol=2e-3)
         np.testing.assert_allclose(after.travelled[late], state.now, rtol=1e-5)
         same = world.loosen(state, jnp.zeros(2, bool))
         jax.tree.map(np.testing.assert_array_equal, same, state)

@@ -167,7 +167,7 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     after, dead = _run(out, jnp.array(False))
     done = jnp.all(after.solved)
     # Who served nothing more was on the way home since it was last free.
-    way = jnp.where(problem.agent_mask, _way_home(after), 0.0)
+    way = jnp.where(problem.agent_mask, _way_home(problem, after.node), 0.0)
     end = jnp.maximum(jnp.max(jnp.where(problem.agent_mask, after.since + way, 0.0)), after.now)
     end = jnp.where(done, end, after.now)
     effort = jnp.sum(problem.effort * (leg + jnp.where(done, way, 0.0)))
@@ -177,9 +177,8 @@ def step(state: MacroState, choice: Array) -> MacroResult:
 def loosen(state: MacroState, who: Array) -> MacroState:
     """The state in which those of `who` [N] bool that are on their way may choose again.
 
-    Where an agent is, p seconds from a and r from b, it is as far from c as Stewart's theorem says
-    of a point of the way from a to b: exact on straight ways, on others kept within what the
-    triangle allows. It stands in `problem.start`, for from now on the agent starts there.
+    How far it is from everywhere (`along`) stands in `problem.start` and `problem.home_now`, for
+    from now on the agent starts there.
     """
     problem = state.problem
     targets = problem.start.shape[1]
@@ -189,30 +188,41 @@ def loosen(state: MacroState, who: Array) -> MacroState:
     bound = jnp.any(jax.nn.one_hot(state.goal, targets, dtype=bool), axis=0)
     due = jnp.any(problem.after & bound[:, None], axis=0)
     who = who & ~state.serving[here] & ~due[here]
-    rest = jnp.minimum(state.busy, state.leg)[:, None]
-    gone = (state.leg[:, None] - rest)
-    near, far = legs(problem, state.origin), legs(problem, state.node)  # [N, M] from a, from b
-    square = (rest * near**2 + gone * far**2) / jnp.maximum(state.leg, SOON)[:, None] - gone * rest
-    low = jnp.maximum(jnp.abs(near - gone), jnp.abs(far - rest))
-    high = jnp.minimum(near + gone, far + rest)
-    start = jnp.clip(jnp.sqrt(jnp.maximum(square, 0.0)), jnp.minimum(low, high), high)
-    start = jnp.where((near >= FAR) | (far >= FAR), jnp.where(high >= FAR, FAR, high), start)
+    rest = jnp.minimum(state.busy, state.leg)
+    start = along(legs(problem, state.origin), legs(problem, state.node),
+                  (state.leg - rest)[:, None], rest[:, None])
     own = jax.nn.one_hot(state.goal, targets, dtype=bool)
-    start = jnp.where(own, rest, start)
-    out = replace(problem, start=jnp.where(who[:, None], start, problem.start))
-    travelled = state.travelled - jnp.where(who, rest[:, 0], 0.0)
+    start = jnp.where(own, rest[:, None], start)
+    near, far = _way_home(problem, state.origin), _way_home(problem, state.node)
+    # Of those that need not go home both are 0, where nobody has anywhere to go.
+    home = jnp.where((near <= 0) & (far <= 0), 0.0, along(near, far, state.leg - rest, rest))
+    out = replace(problem, start=jnp.where(who[:, None], start, problem.start),
+                  home_now=jnp.where(who, home, problem.home_now))
+    travelled = state.travelled - jnp.where(who, rest, 0.0)
     return replace(
         state, problem=out, travelled=travelled, node=jnp.where(who, targets, state.node),
-        goal=jnp.where(who, targets, state.goal), busy=jnp.where(who, 0.0, state.busy))
+        goal=jnp.where(who, targets, state.goal), busy=jnp.where(who, 0.0, state.busy),
+        since=jnp.where(who, state.now, state.since))
 
 
-def _way_home(state: MacroState) -> Array:
-    """[N] s home from where each agent is."""
-    problem = state.problem
+def along(near: Array, far: Array, gone: Array, rest: Array) -> Array:
+    """s to c from the point of the way from a to b that is `gone` s from a and `rest` s from b.
+
+    Stewart's theorem, of `near` s from a to c and `far` s from b to c: exact on straight ways, on
+    others kept within what the triangle allows.
+    """
+    square = (rest * near**2 + gone * far**2) / jnp.maximum(gone + rest, SOON) - gone * rest
+    low = jnp.maximum(jnp.abs(near - gone), jnp.abs(far - rest))
+    high = jnp.minimum(near + gone, far + rest)
+    there = jnp.clip(jnp.sqrt(jnp.maximum(square, 0.0)), jnp.minimum(low, high), high)
+    return jnp.where((near >= FAR) | (far >= FAR), jnp.where(high >= FAR, FAR, high), there)
+
+
+def _way_home(problem: MacroProblem, node: Array) -> Array:
+    """[N] s home from where each agent is (`node` [N], M: its start)."""
     targets = problem.start.shape[1]
-    at = jnp.take_along_axis(problem.home, jnp.minimum(state.node, targets - 1)[:, None],
-                             axis=1)[:, 0]
-    return jnp.where(state.node == targets, problem.home_now, at)
+    at = jnp.take_along_axis(problem.home, jnp.minimum(node, targets - 1)[:, None], axis=1)[:, 0]
+    return jnp.where(node == targets, problem.home_now, at)
 
 
 def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
