@@ -21,6 +21,7 @@ from moonteam.errors import InputError
 from training.bench import peer_process
 from training.bench.measure import Wanted
 from training.bench.peer_process import LOOP, Load, Recipe
+from training.mappo.macro.config import PRESETS
 
 CONFIG = Path("baselines/MAPPO/config/mappo_homogenous_rnn_mpe.yaml")
 OURS, THEIRS = "moonteam", "JaxMARL mappo_rnn_mpe"
@@ -77,13 +78,14 @@ def measure(args: Wanted, checkout: Path, command: str) -> dict[str, Any]:
     from moonteam.report import provenance
     from moonteam.report.progress import say, track
 
-    for name in ("preset", "phase", "precision"):
+    macro = args.preset in PRESETS
+    for name in ("phase", "precision") if macro else ("preset", "phase", "precision"):
         if getattr(args, name) != getattr(Wanted(), name):
             raise InputError(name, "has no meaning beside JaxMARL, whose shapes are taken")
     if args.updates < 1:
         raise InputError("updates", f"{args.updates} is not allowed; at least 1")
     numbers = recipe(checkout, args.num_envs, args.num_minibatches)
-    load = Load(checkout.resolve(), numbers, args.updates)
+    load = Load(checkout.resolve(), numbers, args.updates, args.preset if macro else "")
     with _sides(load) as sides:
         rows = []
         for side in sides:  # one after the other, so that compilation has the machine
@@ -95,11 +97,10 @@ def measure(args: Wanted, checkout: Path, command: str) -> dict[str, Any]:
                 row["seconds_of_each"].append(side.ask("run"))
         for side, row in zip(sides, rows, strict=True):
             row["peak_bytes"], row["peak_of"] = side.ask("end")
-    env_steps = numbers.num_envs * numbers.num_steps
     for row in rows:
-        _add_rates(row, env_steps, args.updates, numbers)
-    return _document(rows, numbers, load, args.repeats) | {
-        "meta": provenance.meta(command, 0)}
+        _add_rates(row, args.updates, numbers)
+    make = _beside_macro if macro else _document
+    return make(rows, numbers, load, args.repeats) | {"meta": provenance.meta(command, 0)}
 
 
 @contextlib.contextmanager
@@ -107,7 +108,8 @@ def _sides(load: Load) -> Iterator[list[Side]]:
     """Both processes, ended on the way out."""
     context, sides = multiprocessing.get_context("spawn"), []
     try:
-        for name, serve in ((OURS, peer_process.ours), (THEIRS, peer_process.theirs)):
+        own = peer_process.macro if load.preset else peer_process.ours
+        for name, serve in ((OURS, own), (THEIRS, peer_process.theirs)):
             here, there = context.Pipe()
             process = context.Process(target=peer_process.serve, args=(there, serve, load),
                                       daemon=True)
@@ -123,13 +125,18 @@ def _sides(load: Load) -> Iterator[list[Side]]:
                 side.process.terminate()
 
 
-def _add_rates(row: dict[str, Any], env_steps: int, updates: int, numbers: Recipe) -> None:
-    """Seconds of an update in the best run, without beginning, and what follows from them."""
+def _add_rates(row: dict[str, Any], updates: int, numbers: Recipe) -> None:
+    """Seconds of an update in the best run, without beginning, and what follows from them.
+
+    An env step of macro-decisions is a decision; its side says how many, and their work.
+    """
     row["seconds"] = max(min(row["seconds_of_each"]) - row["begin_s"], 1e-9) / updates
-    row["env_steps_per_s"] = env_steps / row["seconds"]
-    row["flops_per_env_step"] = 2 * (1 + 3 * numbers.update_epochs) * sum(
-        kernels * count for kernels, count in zip(
-            row["kernel_parameters"].values(), row["networks_per_env_step"].values(), strict=True))
+    row["env_steps_per_s"] = row.get("steps", numbers.num_envs * numbers.num_steps) / row["seconds"]
+    row["flops_per_env_step"] = row["flops"] if "flops" in row else (
+        2 * (1 + 3 * numbers.update_epochs) * sum(
+            kernels * count for kernels, count in zip(
+                row["kernel_parameters"].values(), row["networks_per_env_step"].values(),
+                strict=True)))
     row["achieved_gflops"] = row["flops_per_env_step"] * row["env_steps_per_s"] / 1e9
 
 
@@ -158,6 +165,23 @@ def _document(rows: list[dict[str, Any]], numbers: Recipe, load: Load,
                 "num_agents": ours["num_agents"], "obs_size": ours["obs_size"],
                 "critic_input": ours["num_agents"] * ours["obs_size"],
                 "num_actions": ours["num_actions"]},
+            "jaxmarl_commit": theirs["commit"], "notes": notes}
+
+
+def _beside_macro(rows: list[dict[str, Any]], numbers: Recipe, load: Load,
+                  repeats: int) -> dict[str, Any]:
+    """Unlike problems and networks: only the work of the networks can be put side by side."""
+    ours, theirs = rows
+    ratio = ours["achieved_gflops"] / theirs["achieved_gflops"]
+    notes = [
+        f"Ours decides for the team at an event, theirs for each agent at every step of "
+        f"{numbers.env_name} ({numbers.num_envs} environments x {numbers.num_steps} steps, "
+        f"{numbers.update_epochs} epochs, {numbers.num_minibatches} minibatches).",
+        f"At the same network work, which is what GFLOP/s count, ours collects and learns "
+        f"{ratio:.2f} times as much a second (best of {repeats} runs of {load.updates} updates).",
+        *(f"{row['name']}: {note}" for row in rows for note in row["notes"])]
+    return {"title": "training beside JaxMARL", "rows": rows, "ratio": ratio, "repeats": repeats,
+            "updates": load.updates, "preset": load.preset, "shape": msgspec.to_builtins(numbers),
             "jaxmarl_commit": theirs["commit"], "notes": notes}
 
 

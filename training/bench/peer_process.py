@@ -48,6 +48,8 @@ class Load:
     recipe: Recipe
     updates: int
     """In one run."""
+    preset: str = ""
+    """Of macro-decisions, which then is our side."""
 
 
 Built = tuple[Callable[[], Any], dict[str, Any]]
@@ -115,6 +117,22 @@ def ours(load: Load) -> Built:
            "obs_size": task.obs_size, "num_actions": task.num_actions,
            "networks_per_env_step": {"actor": agents, "critic": 1}, "notes": []}
     return lambda: program(learner), row
+
+
+def macro(load: Load) -> Built:
+    """Our learner on macro-decisions, by the critic, spread over all devices."""
+    from training import sharding
+    from training.bench import macro as bench
+
+    chosen = bench.config(load.preset, "critic")
+    _, once, first = bench.build(chosen)
+    row = {"device": sharding.describe_device(), "compile_s": first, "compiled_bytes": 0,
+           "begin_s": 0.0, "steps": chosen.decisions, "flops": bench.flops(chosen), "notes": [
+               f"{chosen.families[0].name}; {chosen.num_envs} environments x "
+               f"{chosen.hyper.num_steps} decisions, {chosen.hyper.epochs} epochs, "
+               f"{chosen.hyper.minibatches} minibatches; pointer network, {chosen.spec}; compiled "
+               "in: with the first update"]}
+    return lambda: [once() for _ in range(load.updates)], row
 
 
 def theirs(load: Load) -> Built:

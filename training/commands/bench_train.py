@@ -21,8 +21,13 @@ class Args(Reported):
     devices; on a CPU each core counts as one (JAX_NUM_CPU_DEVICES=1 goes back to one). The
     share of peak counts matrix products only, against the fastest square product measured here.
 
+    A preset of macro-decisions (quick, paper_team, any_team) is measured on its first family, once
+    by branches and once by the critic; the unit is a decision of the team.
+
     With --jaxmarl the learner runs beside JaxMARL's published mappo_rnn_mpe loop instead: on its
-    env, with its numbers and networks of its shapes, in turns, each in a process of its own.
+    env, with its numbers and networks of its shapes, in turns, each in a process of its own. With a
+    preset of macro-decisions too, our side is that preset by the critic, on its own problems:
+    what can be compared then is the network's work done in a second.
 
     Files in --out: bench_train.json and table.md.
 
@@ -31,6 +36,8 @@ class Args(Reported):
       moonteam bench train pi_5t --num-envs 256 --num-minibatches 4 --json
       git clone https://github.com/FLAIROx/JaxMARL
       moonteam bench train --jaxmarl JaxMARL --repeats 3
+      moonteam bench train quick
+      moonteam bench train quick --jaxmarl JaxMARL --repeats 3
     """
 
     preset: tyro.conf.Positional[str] = "small"
@@ -58,12 +65,16 @@ class Args(Reported):
 def run(args: Args) -> int:
     """Measures and prints; returns the exit code."""
     from moonteam.report import command, tables
-    from training.bench import ours, peer
+    from training.bench import macro, ours, peer
+    from training.mappo.macro.config import PRESETS
 
     if args.repeats < 1:
         raise InputError("repeats", f"{args.repeats} is not allowed; at least 1")
     made_by = command.line("bench train", args)
-    if args.jaxmarl is None:
+    if args.jaxmarl is None and args.preset in PRESETS:
+        document = macro.measure(args.wanted, made_by)
+        shown = [macro.table(document)]
+    elif args.jaxmarl is None:
         document = ours.measure(args.wanted, made_by)
         shown = [ours.table(document)]
     else:

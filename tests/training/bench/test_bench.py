@@ -8,13 +8,22 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
+from moonteam.grid.macro.draw import Draw
+from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.recurrent import Recurrent
-from training.bench import measure, ours, peer
+from training.bench import macro, measure, ours, peer
 from training.bench.jaxmarl_task import JaxmarlTask
 from training.mappo import rollout
+from training.mappo.macro.config import PRESETS, MacroConfig, Practice
+from training.mappo.macro.hyper import Hyper, Vine
 from training.mappo.networks import Networks
 
 SPREAD = "MPE_simple_spread_v3"
+SMALL = MacroConfig(
+    "quick", (Practice("small", Draw(agents=(2, 2), targets=(2, 2), sides=(6, 6), limit=60.0)),),
+    rounds=1, num_envs=8, hyper=Hyper(num_steps=4, learned=0.5, minibatches=2),
+    vine=Vine(episodes=8, num_steps=4, moments=16, minibatches=2),
+    spec=PointerSpec(width=16, heads=2, layers=1, pairs=8))
 NUMBERS = """
 "ENV_NAME": "MPE_simple_spread_v3"
 "LR": 2e-3
@@ -193,3 +202,38 @@ def test_a_config_that_does_not_fit(checkout):
     path.write_text(NUMBERS.replace('"GAMMA": 0.99', '"GAMMA": high'))
     with pytest.raises(InputError, match="float"):
         peer.recipe(checkout, None, None)
+
+
+def test_products_are_counted_by_hand():
+    """A matrix product of 2 x 3 and 3 x 5, five times in a scan, and one batched of 4."""
+    def work(a, b):
+        looped, _ = jax.lax.scan(lambda x, _: (x + (a @ b).sum(), None), 0.0, None, 5)
+        return looped, jnp.einsum("kij,kjl->kil", jnp.ones((4, 2, 3)), jnp.ones((4, 3, 5)))
+
+    assert macro.products(jax.jit(work), jnp.ones((2, 3)), jnp.ones((3, 5))) == (5 + 4) * 2 * 30
+
+
+def test_macro_decisions_on_the_bench(monkeypatch):
+    monkeypatch.setitem(PRESETS, "quick", SMALL)
+    found = macro.measure(measure.Wanted("quick", repeats=1), "moonteam bench train quick")
+    vine, critic = found["rows"]
+    assert vine["decisions"] == SMALL.vine.moments
+    assert vine["branches_per_s"] * vine["seconds"] >= vine["decisions"]
+    assert critic["decisions"] == SMALL.num_envs * SMALL.hyper.num_steps
+    assert critic["decisions_per_s"] * critic["seconds"] == pytest.approx(critic["decisions"])
+    titles, rows = macro.table(found)
+    assert all(len(row) == len(titles) for row in rows)
+    with pytest.raises(InputError, match="has no meaning for quick"):
+        macro.measure(measure.Wanted("quick", num_envs=4), "")
+
+
+@pytest.mark.skipif(find_spec("jaxmarl") is None, reason="importing it here would end capsys")
+def test_macro_decisions_beside_the_loop(checkout, capsys):
+    """The process of our side has the presets as they ship, so this compiles quick."""
+    words = ["bench", "train", "quick", "--jaxmarl", str(checkout), "--num-envs", "4", "--updates",
+             "1", "--repeats", "1", "--json"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    ours, theirs = found["rows"]
+    assert ours["flops_per_env_step"] > theirs["flops_per_env_step"]
+    assert found["ratio"] == pytest.approx(ours["achieved_gflops"] / theirs["achieved_gflops"])

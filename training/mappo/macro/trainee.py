@@ -103,12 +103,12 @@ class MacroMappo:
                 key = jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
                                          number * len(config.families) + i)
                 with jax.default_matmul_precision(PRECISION[config.precision]):
-                    reports.append(self._round(i, family, key, lr, entropy))
+                    reports.append(self.practise(i, family, key, lr, entropy))
         return Made(count, count * config.decisions, _summary(gather(reports)))
 
-    def _round(self, i: int, family: Practice, key: Array, lr: np.float32,
-               entropy: np.float32) -> Report | Grown:
-        """One update on a family."""
+    def practise(self, i: int, family: Practice, key: Array, lr: np.float32,
+                 entropy: np.float32) -> Report | Grown:
+        """One update on a family, which is the config's number i."""
         config, walk = self.config, self.walks[i]
         if walk is None:
             self.learner, grown = improve(
