@@ -11,13 +11,14 @@ from moonteam import files
 from moonteam.commands.options import Reported
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
-from training.run.compare import Kind, grouped, listed, notes, one_kind, plain, read, summary
+from training.run.compare import Kind, grouped, listed, notes, plain, read, shared, summary
 
 
 @dataclass(frozen=True)
 class Args(Reported):
     """Put run folders of `moonteam train` side by side: those of small, laptop and pi_*, those
-    of quick, paper_team and any_team, or those of imitate and refine.
+    of quick, paper_team and any_team, or those of imitate and refine; or unlike ones by what they
+    have in common, success and gap to the optimum over minutes.
 
     Runs that differ only in their seed are one row: the mean over seeds, in brackets the lowest
     and the highest. A row is named by what its numbers differ in from the first of its preset,
@@ -29,6 +30,7 @@ class Args(Reported):
       moonteam train compare runs/small-*
       moonteam train compare runs/small-* runs/no-memory-* --markdown --out runs/compared
       moonteam train compare runs/small-* runs/no-memory-* --label GRU --label feed-forward
+      moonteam train compare runs/quick-0 runs/imitate-quick-0 runs/pi_5t-0 --out runs/compared
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -51,8 +53,8 @@ def run(args: Args) -> int:
 
     if not args.runs:
         raise InputError("RUN", "no run folder is given; at least one is needed")
-    found = [read(folder, (MAPPO, MACRO, TAUGHT)) for folder in args.runs]
-    kind, groups = one_kind(found), grouped(found, args.label)
+    found = shared([read(folder, (MAPPO, MACRO, TAUGHT)) for folder in args.runs])
+    kind, groups = found[0].kind, grouped(found, args.label)
     meta = provenance.meta(command.line("train compare", args), 0)
     document = {
         "title": "training runs", "rows_are": "run",

@@ -4,46 +4,57 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import jax
 import tyro
 
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
+from moonteam.policies.entity import EntitySpec, init
 from moonteam.report.progress import say
 from training.commands.ending import Taught, complete
 from training.commands.imitate import entity_policy
 from training.run import metrics
 from training.run.machine import Run
 from training.run.trainee import Row
+from training.sharding import use_all_cores
 from training.teacher.curve import draw_curve
 from training.teacher.presets import PRESETS
 from training.teacher.refinement import Refinement, Refiner
+
+FRESH = "fresh"
 
 
 @dataclass(frozen=True)
 class Args(Taught):
     """Refine an imitated policy by MAPPO, with a centralised critic over the same tokens.
 
+    `fresh` in place of a policy begins from nothing: with --leash 0 --reward bootstrap that is
+    MAPPO step by step without a teacher.
+
     Examples:
       moonteam train refine any_team_imitated --out runs/refined
       moonteam train refine runs/imitate-quick-0/policy.safetensors --families quick --reward paper
       moonteam train refine any_team_imitated --out runs/refined --resume --beside runs/control
+      moonteam train refine fresh --families quick --reward bootstrap --leash 0
     """
 
     policy: tyro.conf.Positional[str]
-    """Policy file (.safetensors) or the name of a bundled policy to begin with."""
+    """Policy file (.safetensors) or the name of a bundled policy to begin with, or `fresh`."""
     families: Literal["quick", "any_team"] = "any_team"
     """The preset whose teams, targets and grounds are practised."""
-    reward: Literal["regret", "paper", "none"] = "regret"
-    """regret: minus the cost lost against the exact planner; paper: the paper's terms; none:
-    imitation of the same states alone, the control."""
+    reward: Literal["regret", "paper", "bootstrap", "none"] = "regret"
+    """regret: minus the cost lost against the exact planner; paper: the paper's terms of its second
+    phase; bootstrap: those of its first; none: imitation of the same states alone, the control."""
     rounds: int = 300
     """Rounds of collection and learning."""
     lr: float = 3e-4
     """Learning rate at the start."""
     leash: float = 0.1
     """Weight of the imitation loss beside the policy's."""
+    ent_coef: float = 0.0
+    """Weight of the entropy."""
     beside: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
     """Folder of another refinement to draw beside this one in beside.png; again for more."""
 
@@ -58,18 +69,26 @@ def run(args: Args) -> int:
     if args.rounds < 1:
         raise InputError("--rounds", f"{args.rounds} is not allowed; at least 1")
     others = {str(folder): _rows(folder) for folder in args.beside}
-    spec, params = entity_policy(args.policy)
+    spec, params = _fresh(args.seed) if args.policy == FRESH else entity_policy(args.policy)
     config = Refinement(
         families=PRESETS[args.families].families, spec=spec, reward=args.reward,
-        rounds=args.rounds, lr=args.lr, leash=args.leash, seed=args.seed)
+        rounds=args.rounds, lr=args.lr, leash=args.leash, ent_coef=args.ent_coef,
+        seed=args.seed)
     out = args.folder("refine", args.seed)
     say("moonteam: making grounds and held-out scenarios, compiling")
-    refiner = Refiner(config, params, source=args.policy)
+    refiner = Refiner(config, params, source="" if args.policy == FRESH else args.policy)
     run = Run(refiner, out, args.resume, args.checkpoint_seconds, tensorboard=args.tensorboard)
     code = complete(run, args.json)
     if others and code == 0:
         draw_curve(out / "beside.png", {str(out): run.metrics.rows} | others)
     return code
+
+
+def _fresh(seed: int) -> tuple[EntitySpec, Any]:
+    """Size and parameters that know nothing."""
+    use_all_cores()
+    spec = EntitySpec()
+    return spec, init(spec, jax.random.key(seed))
 
 
 def _rows(folder: Path) -> list[Row]:

@@ -8,6 +8,7 @@ import msgspec
 
 from training.mappo.curve import draw_curve
 from training.run.compare import Final, Kind, Line
+from training.run.trainee import Row
 
 KEYS = ("success", "makespan", "moves")
 DECODES = ("argmax", "sample")
@@ -19,6 +20,7 @@ class Score(msgspec.Struct, frozen=True):
     success: float
     makespan: float
     moves: float
+    makespan_gap: float | None = None
 
 
 class MappoLine(Line, frozen=True, kw_only=True):
@@ -51,10 +53,15 @@ def _figures(final: MappoFinal) -> dict[str, float]:
             for decode in DECODES for key in KEYS}
 
 
+def _gap(row: Row) -> tuple[float, float] | None:
+    found = row.get("argmax", {})
+    return (found["success"], found["makespan_gap"]) if "makespan_gap" in found else None
+
+
 MAPPO = Kind(
     "name", MappoLine, MappoFinal, _ended, _figures,
     columns=(("argmax_success", "success, argmax", 3), ("sample_success", "success, sampled", 3),
              ("argmax_makespan", "mean T, argmax", 2), ("sample_makespan", "mean T, sampled", 2),
              ("argmax_moves", "mean moves, argmax", 2),
              ("sample_moves", "mean moves, sampled", 2)),
-    note="failures count with max_steps and their real moves", draw=draw_curve)
+    note="failures count with max_steps and their real moves", draw=draw_curve, gap=_gap)

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam import trees
+from moonteam.planners.batch import OPTIMAL, solve_batch
+from training.mappo.grid_task import GridTask
 from training.mappo.networks import Networks
 from training.mappo.task import EnvState, Task
 
@@ -59,6 +61,27 @@ def score(networks: Networks, task: Task, actor: dict, key: Array, num_scenarios
     walk = _Walk(state, networks.empty(num_scenarios).actor, never[0], none, none)
     walk, _ = jax.lax.scan(step, walk, jnp.arange(task.max_steps))
     return Score(walk.solved.mean(), walk.steps.mean(), walk.moves.mean())
+
+
+EXACT_TO = 8
+"""Targets up to which optima are worth their time."""
+
+
+def optimum(task: GridTask, key: Array, num_scenarios: int) -> float | None:
+    """Mean makespan of certified optimal plans for the scenarios that `score` plays with `key`.
+
+    None where it is not known: targets that appear later, or more than `EXACT_TO`.
+    """
+    config = task.config
+    if config.replanning or config.num_targets > EXACT_TO:
+        return None
+    state = jax.device_get(task.reset(jax.random.split(key)[0], num_scenarios).world)
+    problem = state.problem
+    plans = solve_batch(state.cells, problem.agent_skills, problem.target_cells,
+                        problem.target_skills, problem.target_and, solved=state.solved,
+                        agent_mask=problem.agent_mask, steps_left=1024, objective="makespan")
+    assert (plans.status == OPTIMAL).all()
+    return float(plans.makespan.mean())
 
 
 STANDING = 0.5

@@ -32,6 +32,7 @@ class Mappo:
         self.nets: Networks = networks.for_spec(config.spec, config.precision)
         self.mesh = mesh_for(p.num_envs // p.num_minibatches for _, p in config.phases)
         self.phase = ""
+        self._optima: dict[int, float | None] = {}
         self.learner: Learner | None = None
 
     @property
@@ -92,7 +93,7 @@ class Mappo:
         return {}
 
     def evaluate(self, phase: Phase, scenarios: int) -> dict[str, dict[str, float]]:
-        """Held-out scores, argmax and sampled."""
+        """Held-out scores, argmax and sampled; with the gap to the optimum where it is known."""
         key = jax.random.key(held_out.HELD_OUT_SEED)
         actor, scores = gather(self.weights().actor), {}
         for decode in ("argmax", "sample"):
@@ -100,7 +101,17 @@ class Mappo:
                 score = held_out.score(self.nets, self.task(phase), actor, key, scenarios,
                                        decode == "sample")
             scores[decode] = {k: float(v) for k, v in score._asdict().items()}
+            if (best := self._best(scenarios)) is not None:
+                scores[decode]["makespan_gap"] = scores[decode]["makespan"] / best - 1.0
         return scores
+
+    def _best(self, scenarios: int) -> float | None:
+        """Mean optimum of so many held-out scenarios, which are the same in both phases."""
+        if scenarios not in self._optima:
+            key = jax.random.key(held_out.HELD_OUT_SEED)
+            self._optima[scenarios] = held_out.optimum(
+                self.task(self.config.phases[-1][1]), key, scenarios)
+        return self._optima[scenarios]
 
     def weights(self) -> Pair:
         """Parameters of both networks."""

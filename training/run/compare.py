@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import msgspec
 from moonteam import files
 from moonteam.errors import InputError
 from training.run import metrics
+from training.run.curve import draw_gap
 from training.run.trainee import Row
 
 
@@ -51,6 +52,9 @@ class Kind:
     """How failures count."""
     draw: Callable[[Path, dict[str, list[list[Row]]]], None]
     """Curves of groups of runs."""
+    gap: Callable[[Row], tuple[float, float] | None]
+    """Of a line: success and gap of the makespan to the optimum, argmax, held out; None where it
+    holds no evaluation or the optimum is not known."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Trained:
 
     folder: Path
     kind: Kind
+    preset: str  # that it was started from
     config: dict[str, Any]  # flat: "refinement.weights.AR"
     rows: list[Row]
     final: Final
@@ -68,11 +73,6 @@ class Trained:
     def seed(self) -> int:
         """Of everything random in it."""
         return self.config["seed"]
-
-    @property
-    def preset(self) -> str:
-        """That it was started from."""
-        return self.config[self.kind.name_key]
 
 
 def read(folder: Path, kinds: tuple[Kind, ...]) -> Trained:
@@ -85,22 +85,56 @@ def read(folder: Path, kinds: tuple[Kind, ...]) -> Trained:
     path, ended = folder / "metrics.jsonl", folder / "report.json"
     rows = metrics.read(path)
     checked = files.convert(rows, list[kind.line], path)
+    preset = config[kind.name_key]
     if ended.exists():
         final = files.read_json(ended, kind.final)
-        return Trained(folder, kind, flat(config), rows, final, True)
+        return Trained(folder, kind, preset, flat(config), rows, final, True)
     for line in reversed(checked):
         if final := kind.ended(config, line):
-            return Trained(folder, kind, flat(config), rows, final, False)
+            return Trained(folder, kind, preset, flat(config), rows, final, False)
     raise InputError(path, "holds no evaluation on held-out scenarios yet")
 
 
-def one_kind(runs: list[Trained]) -> Kind:
-    """That of all of them. Raises InputError if there are two: they are judged differently."""
+def shared(runs: list[Trained]) -> list[Trained]:
+    """The runs as of one kind: their own, or what unlike kinds have in common.
+
+    Raises InputError where a run lacks that: its problems have no known optimum.
+    """
+    if all(run.kind is runs[0].kind for run in runs):
+        return runs
     for run in runs:
-        if run.kind is not runs[0].kind:
+        if not any(run.kind.gap(row) for row in run.rows):
             raise InputError(run.folder, f"preset {run.preset} is judged by other figures than "
-                             f"{runs[0].preset}, the first; compare them apart")
-    return runs[0].kind
+                             "those beside it, and its gap to the optimum is not in its "
+                             "metrics.jsonl; compare them apart")
+    return [replace(run, kind=COMMON, final=_last_gap(run), rows=[
+        {"seconds": row["seconds"], "gap": found} for row in run.rows
+        if (found := run.kind.gap(row))]) for run in runs]
+
+
+class GapFinal(Final, frozen=True, kw_only=True):
+    """What all kinds have in common."""
+
+    success: float
+    makespan_gap: float
+
+
+def _last_gap(run: Trained) -> GapFinal:
+    """At the last evaluation, of a finished run too: some judge the end on other scenarios."""
+    row, found = next((row, found) for row in reversed(run.rows) if (found := run.kind.gap(row)))
+    final = run.final
+    return GapFinal(env_steps=row["env_steps"], seconds=row["seconds"], device=final.device,
+                    scenarios=run.config.get("eval_scenarios", final.scenarios),
+                    commit=final.commit, success=found[0], makespan_gap=found[1])
+
+
+COMMON = Kind(
+    "", Line, GapFinal, lambda config, line: None,
+    lambda final: {"success": final.success, "makespan_gap": final.makespan_gap},
+    columns=(("success", "success, argmax", 3), ("makespan_gap", "makespan over the optimum", 3)),
+    note="at the last evaluation of each run, on its own problems; failures count with the limit",
+    draw=draw_gap, gap=lambda row: row["gap"])
+"""Of runs that are judged differently."""
 
 
 def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -54,4 +54,8 @@ def kind(name_key: str, figures: type, columns: tuple[tuple[str, str, int], ...]
         return {key: sum(getattr(row, key) for row in found.families) / len(found.families)
                 for key, _, _ in columns}
 
-    return Kind(name_key, FamiliesLine[figures], final, ended, means, columns, note, draw)
+    def gap(row: Row) -> tuple[float, float] | None:
+        found = row.get("families")
+        return (mean(row, "success"), mean(row, "makespan_gap")) if found else None
+
+    return Kind(name_key, FamiliesLine[figures], final, ended, means, columns, note, draw, gap)

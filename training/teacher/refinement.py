@@ -1,8 +1,9 @@
 """Refinement of an imitated policy by MAPPO, with a centralised critic over the same tokens.
 
-Two rewards, one learner, and a control:
+Two kinds of reward, one learner, and a control:
 
-- `paper`: the weighted sum of the paper's terms as active in its refinement phase.
+- `paper`: the weighted sum of the paper's terms as active in its refinement phase; `bootstrap`:
+  those of its first phase, which lead a policy that knows nothing yet.
 - `regret`: minus what a step lost against the exact planner. With V*(s) the least weighted
   cost (1 - p) * makespan + p * moves that is still possible from s, and c the cost of the step
   itself, the reward is V*(s) - c - V*(s'): zero for a step that an optimal plan could take,
@@ -53,7 +54,7 @@ from training.teacher.families import (
 from training.teacher.imitation import imitate_loss
 from training.teacher.pupil import Learner, Pupil
 
-Reward = Literal["regret", "paper", "none"]
+Reward = Literal["regret", "paper", "bootstrap", "none"]
 
 
 @dataclass(frozen=True)
@@ -127,17 +128,17 @@ class Minibatch(NamedTuple):
     weight: Array  # [B] 0 where the step was cut off and its end unknown
 
 
-def reward_config(family: Family) -> EnvConfig:
-    """The family's env with the weights and the C_AR that the paper refined with."""
+def reward_config(family: Family, reward: Reward) -> EnvConfig:
+    """The family's env with the weights and the C_AR that the paper had in that phase."""
     few = rewards.preset("pi_7t" if family.num_targets > 6 else "pi_5t")
-    return few.apply(family.config, "refinement")
+    return few.apply(family.config, "bootstrap" if reward == "bootstrap" else "refinement")
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def collect(spec: EntitySpec, family: Family, steps: int, params: Any, ground: Ground | None,
-            walk: Walk) -> tuple[Walk, Collected]:
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def collect(spec: EntitySpec, family: Family, reward: Reward, steps: int, params: Any,
+            ground: Ground | None, walk: Walk) -> tuple[Walk, Collected]:
     """The policy's own samples for `steps` steps; ended episodes give way to new ones."""
-    config = reward_config(family)
+    config = reward_config(family, reward)
 
     def step(walk: Walk, _: None) -> tuple[Walk, tuple]:
         act_key, new_key, key = jax.random.split(walk.key, 3)
@@ -267,7 +268,8 @@ class Refiner(Pupil):
         keys = jax.random.split(jax.random.key(config.seed + 1_000_003), len(config.families))
         super().__init__(config, name, source, Learner.begin(params, optimiser(config)), keys, envs,
                          [*envs, *(e * config.num_steps // config.minibatches for e in envs)])
-        self.method = f"MAPPO from imitation, reward {config.reward}"
+        begun = "from imitation" if source else "from scratch, a step a decision"
+        self.method = f"MAPPO {begun}, reward {config.reward}, leash {config.leash:g}"
 
     @property
     def states_a_round(self) -> int:
@@ -302,13 +304,13 @@ class Refiner(Pupil):
     def _experience(self, i: int) -> tuple[Walk, Minibatch, float]:
         """One rollout of a family, with advantages and labels."""
         config, ground = self.config, self.grounds[i]
-        walk, rollout = collect(config.spec, config.families[i], config.num_steps,
+        walk, rollout = collect(config.spec, config.families[i], config.reward, config.num_steps,
                                 self.learner.params, ground, self.walks[i])
         rollout = jax.device_get(rollout)
         judged = judge(config.families[i], ground, rollout.states, rollout.place,
                        rollout.preference)
         regret = regrets(config, rollout, judged)
-        gain = rollout.reward if config.reward == "paper" else regret
+        gain = regret if config.reward == "regret" else rollout.reward
         # A cut-off episode's last state is gone: its step is not learned from.
         known = judged.known[:-1] & (judged.known[1:] | rollout.terminated) & ~rollout.truncated
         gain = np.where(known, gain, 0.0)

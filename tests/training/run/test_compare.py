@@ -154,7 +154,7 @@ def test_a_half_written_last_line_is_left_out(tmp_path, capsys):
     assert compare(capsys, path)["summary"][0]["argmax_success"] == pytest.approx(0.9)
 
 
-def test_two_kinds_are_not_in_one_table(tmp_path, capsys):
+def test_two_kinds_are_in_one_table_by_what_both_have(tmp_path, capsys):
     mappo = folder(tmp_path / "run", 0.9)
     taught = tmp_path / "taught"
     look = {"family": "2 robots", "success": 0.5, "makespan_gap": 0.2, "success_effort": 0.4,
@@ -163,8 +163,20 @@ def test_two_kinds_are_not_in_one_table(tmp_path, capsys):
     files.write_text(taught / "metrics.jsonl", files.dump_json(
         {"phase": "imitation", "env_steps": 6, "seconds": 1.0, "labelled": 3,
          "families": [look, look | {"success": 1.0}]}) + "\n")
-    assert main(["train", "compare", mappo, str(taught)]) == 2
-    assert "quick is judged by other figures than small" in capsys.readouterr().err
+    assert main(["train", "compare", mappo, str(taught)]) == 2  # written without gaps
+    err = capsys.readouterr().err
+    assert "small is judged by other figures than those beside it, and its gap" in err
+    path = tmp_path / "run" / "metrics.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    for row in rows:
+        if "argmax" in row:
+            row["argmax"] |= {"makespan_gap": 30.0 / row["total_updates"]}
+    files.write_text(path, "".join(files.dump_json(row) + "\n" for row in rows))
+    both = tmp_path / "both"
+    found = compare(capsys, mappo, str(taught), "--out", str(both))["summary"]
+    assert [(r["planner"], r["success"], r["makespan_gap"], r["seconds"]) for r in found] == [
+        ("small", 0.9, 5.0, 12.0), ("quick", 0.75, pytest.approx(0.2), 1.0)]
+    assert (both / "curves.png").stat().st_size > 0
     out = tmp_path / "out"
     assert main(["train", "compare", str(taught), "--out", str(out)]) == 0
     (row,) = json.loads((out / "compare.json").read_text())["summary"]

@@ -30,7 +30,7 @@ PARAMS = entity.init(SPEC, jax.random.key(0))
 def rollout():
     """A rollout on the host with what the planner says of it."""
     refiner = Refiner(dataclasses.replace(TINY, num_envs=64), PARAMS)
-    _, got = collect(SPEC, SMALL, 40, PARAMS, None, refiner.walks[0])
+    _, got = collect(SPEC, SMALL, "paper", 40, PARAMS, None, refiner.walks[0])
     got = jax.device_get(got)
     return got, judge(SMALL, None, got.states, got.place, got.preference)
 

@@ -1,0 +1,47 @@
+"""How far runs of any kind are from the optimum, over minutes of training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from moonteam import files
+from training.run.trainee import Row
+
+
+def draw_gap(path: Path, groups: dict[str, list[list[Row]]]) -> None:
+    """Success, and gap of the makespan to the optimum, over minutes, logarithmic.
+
+    Args:
+      path: PNG.
+      groups: runs by name, one colour each; their rows hold seconds and gap, the success and the
+        gap of an evaluation.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import PercentFormatter
+
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2)
+    titles = ("success, argmax", "makespan over the optimum, argmax")
+    for index, (name, runs) in enumerate(groups.items()):
+        for number, rows in enumerate(runs):
+            looks = [row for row in rows if row["seconds"] > 0]
+            minutes = [row["seconds"] / 60 for row in looks]
+            for i, axis in enumerate(axes):
+                axis.plot(minutes, [row["gap"][i] for row in looks], ".-", color=f"C{index}",
+                          alpha=1.0 if len(runs) == 1 else 0.6, label=None if number else name)
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set_title(title)
+        axis.set_xlabel("minutes of training")
+        axis.set_xscale("log")
+        axis.grid(alpha=0.3, which="both")
+        axis.xaxis.set_major_formatter("{x:g}")
+    axes[0].yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes[1].set_yscale("log")
+    for which in (axes[1].yaxis.set_major_formatter, axes[1].yaxis.set_minor_formatter):
+        which(PercentFormatter(1.0, decimals=0))
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, ncols=2,
+                  loc="outside lower center")
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120)
