@@ -8,6 +8,7 @@ whoever read the output (`| head`) went away.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import sys
@@ -92,9 +93,10 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
     try:
-        code = _run(words)
-        sys.stdout.flush()  # here, where a reader that went away is still caught
-        return code
+        try:
+            return _run(words)
+        finally:
+            sys.stdout.flush()  # here, where a reader that went away is still caught
     except InputError as error:
         print(f"moonteam: {error}", file=sys.stderr)
         return 2
@@ -105,9 +107,47 @@ def main(argv: list[str] | None = None) -> int:
         # What is still in the buffer has no reader: Python must not try to write it at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except Exception as error:
+        problem = _unwritable(error) or _surroundings()
+        if problem is None:
+            raise
+        print(f"moonteam: {problem}", file=sys.stderr)
+        return 2
+
+
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR,
+              errno.EEXIST, errno.ENAMETOOLONG, errno.EFBIG)
+RENDERERS = ("egl", "osmesa", "glfw", "disable")
+"""What MUJOCO_GL may be, for us; mujoco knows other words for the same."""
+
+
+def _unwritable(error: Exception) -> str | None:
+    """One line of an error that is the disk's or its permissions', with the file if it is known."""
+    if not isinstance(error, OSError) or error.errno not in UNWRITABLE:
+        return None
+    where = error.filename2 or error.filename
+    return f"{where}: {error.strerror}" if where else str(error.strerror)
+
+
+def _surroundings() -> str | None:
+    """One line of what in the environment lets nothing run; None where all is well with it."""
+    renderer, platforms = os.environ.get("MUJOCO_GL", ""), os.environ.get("JAX_PLATFORMS", "")
+    if renderer and "mujoco" not in sys.modules and renderer.lower() not in RENDERERS:
+        return f"MUJOCO_GL: {renderer!r} is not allowed; one of: {', '.join(RENDERERS)}"
+    if platforms and "jax" in sys.modules:
+        import jax
+
+        try:
+            jax.devices()
+        except (AssertionError, RuntimeError):
+            return (f"JAX_PLATFORMS: there is no device of {platforms!r} here; unset it, or set it "
+                    "to cpu")
+    return None
 
 
 def _run(words: list[str]) -> int:
+    # With 64 bits JAX draws other numbers, and the same seed would give other results.
+    os.environ["JAX_ENABLE_X64"] = "0"
     if not words or words[0] in ("-h", "--help", "help"):
         print(usage())
         return 0 if words else 2

@@ -62,10 +62,18 @@ def rendering() -> tuple[bool, str]:
                    f"libgl1-mesa-dri libglx-mesa0 ({last})")
 
 
-def examine() -> dict:
-    """Everything the command reports, as a JSON-able document."""
+def devices() -> list[dict[str, str]]:
+    """Those that JAX computes on; none where JAX_PLATFORMS asks for what is not there."""
     import jax
 
+    try:
+        return [{"platform": d.platform, "kind": d.device_kind} for d in jax.devices()]
+    except (AssertionError, RuntimeError):
+        return []
+
+
+def examine() -> dict:
+    """Everything the command reports, as a JSON-able document."""
     drawn, how = rendering()
     try:
         import imageio_ffmpeg
@@ -78,7 +86,7 @@ def examine() -> dict:
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "packages": versions(),
-        "devices": [{"platform": d.platform, "kind": d.device_kind} for d in jax.devices()],
+        "devices": devices(),
         "rendering": {"works": drawn, "note": how},
         "ffmpeg": video,
         "cache": str(compilation.cache_folder()),
@@ -102,6 +110,9 @@ def run(args: Args) -> int:
         table.add_row(name, version or "not installed")
     for device in found["devices"]:
         table.add_row("JAX device", f"{device['platform']}: {device['kind']}")
+    if not found["devices"]:
+        asked = os.environ.get("JAX_PLATFORMS")
+        table.add_row("JAX device", f"none of JAX_PLATFORMS={asked}; unset it, or set it to cpu")
     table.add_row("3-D rendering", found["rendering"]["note"])
     table.add_row("video", f"ffmpeg {found['ffmpeg']}" if found["ffmpeg"] else "no ffmpeg found")
     table.add_row("cache", found["cache"])

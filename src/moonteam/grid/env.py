@@ -157,10 +157,11 @@ def _replace_solved(problem: Problem, newly: Array) -> tuple[Problem, Array]:
     turn = buffer.used + jnp.cumsum(newly) - 1  # [M] which buffered target a slot would take
     replaced = newly & (turn < count)
     index = jnp.clip(turn, 0, count - 1)
+    used = buffer.used + jnp.sum(newly, dtype=jnp.int32)
     return replace(
         problem,
         target_cells=jnp.where(replaced[:, None], buffer.cells[index], problem.target_cells),
         target_skills=jnp.where(replaced, buffer.skills[index], problem.target_skills),
         target_and=jnp.where(replaced, buffer.both[index], problem.target_and),
-        buffer=replace(buffer, used=jnp.minimum(buffer.used + jnp.sum(newly), count)),
+        buffer=replace(buffer, used=jnp.minimum(used, count)),
     ), replaced

@@ -202,7 +202,7 @@ def agree(pointer: Array, view: Entities) -> Array:
         mine = everyone.reshape((1,) * turn.ndim + (agents,)) == turn[..., None]  # [..., N]
         row = jnp.sum(jnp.where(mine[..., None], logits, 0.0), axis=-2)
         choice = jax.nn.one_hot(jnp.argmax(row, axis=-1), row.shape[-1], dtype=bool)[..., :-1]
-        skills = jnp.sum(jnp.where(mine, view.agent_skills, 0), axis=-1)
+        skills = jnp.sum(jnp.where(mine, view.agent_skills, 0), axis=-1, dtype=jnp.int32)
         left = jnp.where(view.target_and, missing & ~skills[..., None], 0)
         missing = jnp.where(choice, left, missing)  # [..., M]
         waiting = waiting & ~mine

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from moonteam import trees
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.macro.types import FAR, MacroProblem, plain
 from moonteam.grid.sampling import sample
@@ -128,7 +129,7 @@ def draw(family: Draw, key: Array) -> MacroProblem:
         made = jax.tree.map(lambda a, b: jnp.where(straight, b, a), *made)
     else:
         made = of_grid(problem, cells, family.limit, family.metric, speed, family.num_skills)
-    return asking(family, made, more)
+    return trees.single(asking(family, made, more))
 
 
 def paces(family: Draw, key: Array) -> Array:

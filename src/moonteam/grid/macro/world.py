@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from moonteam import trees
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroResult, MacroState
 
 SOON = 5e-4
@@ -26,12 +27,13 @@ SOON = 5e-4
 
 def reset(problem: MacroProblem) -> MacroState:
     """The first moment at which somebody can decide."""
+    problem = trees.single(problem)
     agents, targets = problem.start.shape
-    none = jnp.full(agents, targets, jnp.int32)
+    none, zero = jnp.full(agents, targets, jnp.int32), jnp.zeros(agents, jnp.float32)
     start = MacroState(
-        problem=problem, now=jnp.zeros(()), node=none, origin=none, leg=jnp.zeros(agents),
+        problem=problem, now=jnp.zeros((), jnp.float32), node=none, origin=none, leg=zero,
         goal=none, busy=problem.free, serving=jnp.zeros(targets, bool),
-        solved=~problem.target_mask, since=problem.free, travelled=jnp.zeros(agents))
+        solved=~problem.target_mask, since=problem.free, travelled=zero)
     return _run(start, jnp.any(free(start)))[0]
 
 
