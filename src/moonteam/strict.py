@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
@@ -75,7 +75,8 @@ def _short(text: str) -> str:
 class _Loader(yaml.SafeLoader):
     """Numbers, truth values and null as in the core schema of YAML 1.2; all else is text."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}
+
+_Loader.yaml_implicit_resolvers = {}  # its own, to be filled below
 
 
 def _constructor(kind: str, what: str, pattern: re.Pattern[str], make: Any) -> None:

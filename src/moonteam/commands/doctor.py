@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from moonteam import compilation, files, paths
 from moonteam.commands.options import Printed
 
-PACKAGES = ("jax", "flax", "mujoco", "mujoco-mjx", "terraingenpy", "numba", "ortools")
+PACKAGES = ("jax", "flax", "mujoco", "mujoco-mjx", "terraingenpy", "rasterio", "numba", "ortools")
 
 RENDER_PROBE = """
 import os

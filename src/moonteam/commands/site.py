@@ -50,7 +50,8 @@ class Args(Saved, Printed):
     """side of a mission cell, m, for the traversability maps"""
 
     dem: Path | None = None
-    """elevation model to import: GeoTIFF, or .npy [rows, columns] m with north first"""
+    """elevation model to import: GeoTIFF, ISIS cube or another raster in metres, or .npy [rows,
+    columns] m with north first"""
 
     centre: tuple[float, float] = (0.0, 0.0)
     """of the window, m east and north of the elevation model's centre"""
@@ -61,8 +62,8 @@ class Args(Saved, Printed):
     band: int = 0
     """of a GeoTIFF, counted from 0"""
 
-    scale: float = 1.0
-    """multiplies the elevations of --dem, for models not in metres"""
+    scale: float | None = None
+    """metres a unit of elevation of --dem, if the file is wrong or does not say"""
 
     detrend: bool = False
     """take the plane of best fit out of --dem"""

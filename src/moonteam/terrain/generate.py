@@ -138,29 +138,6 @@ def roughness_exponent(heights: np.ndarray, spacing: float) -> tuple[float, floa
     return float(found.hurst), float(found.deviation)
 
 
-def read_dem(path: str | os.PathLike[str], band: int) -> tuple[np.ndarray, float, bool]:
-    """Band `band` (from 0) of a GeoTIFF: elevations, metres a pixel, whether they are metres.
-
-    No-data becomes NaN. Raises ValueError with a line a user can read.
-    """
-    try:
-        info = tg.read_geotiff_info(path)
-        if not 0 <= band < info.bands:
-            raise ValueError(f"has no band {band}; it has {info.bands}, counted from 0")
-        raster = tg.read_geotiff(path, band)
-    except tg.GeoTiffError as error:
-        raise ValueError(f"is not a GeoTIFF that can be read: {error}") from None
-    heights = np.array(raster.values, np.float64)[::-1]
-    if raster.no_data is not None:
-        heights[heights == np.float64(np.float32(raster.no_data))] = np.nan
-    scaling = info.band_scaling[band] if len(info.band_scaling) > band else None
-    if scaling is not None:
-        heights = heights * scaling.scale + scaling.offset
-    columns = info.transform.to_gdal()
-    pixel = math.hypot(columns[1], columns[4]) if info.georeferenced else math.nan
-    return heights, pixel, not info.geo_keys.is_geographic
-
-
 def write_dem(path: str | os.PathLike[str], heights: np.ndarray, spacing: float) -> None:
     """Writes elevations [ny, nx] m as a float32 GeoTIFF with the site's centre at (0, 0)."""
     tg.write_geotiff(path, _raster(heights, spacing))
@@ -177,10 +154,11 @@ def spectrum(heights: np.ndarray, pixel: float) -> tuple[float, float] | None:
     return (min(max(found.slope, 2.0), 4.0), found.octave_rms) if found.octave_rms > 0 else None
 
 
-def refine(heights: np.ndarray, pixel: float, shape: tuple[int, int], spacing: float, seed: int,
-           detail: tuple[float, float] | None) -> np.ndarray:
-    """Elevations [rows, columns] at `pixel` m resampled to `shape` at `spacing` m, same centre.
+def refine(heights: np.ndarray, pixel: float, shift: tuple[float, float], shape: tuple[int, int],
+           spacing: float, seed: int, detail: tuple[float, float] | None) -> np.ndarray:
+    """Elevations [rows, columns] at `pixel` m resampled to `shape` at `spacing` m.
 
+    Its centre is `shift` m east and north of theirs.
     With `detail`, a spectrum, relief finer than the source's pixels continues it.
     """
     raster = _raster(heights, pixel)
@@ -190,7 +168,7 @@ def refine(heights: np.ndarray, pixel: float, shape: tuple[int, int], spacing: f
             pixel_size=pixel, slope=detail[0], octave_rms=detail[1],
             min_wavelength=4 * spacing, seed=_seeds(seed, 1)[0])))
     generator = tg.TerrainGenerator(tg.RasterSource(raster), layers)
-    grid = tg.RasterGrid.centered(shape[1], shape[0], spacing)
+    grid = tg.RasterGrid.centered(shape[1], shape[0], spacing, shift)
     return np.array(tg.evaluate(generator, grid=grid).values, np.float32)[::-1].copy()
 
 

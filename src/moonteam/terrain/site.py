@@ -21,7 +21,7 @@ import trimesh
 
 from moonteam.errors import InputError
 from moonteam.problem.mission import Mission
-from moonteam.terrain import generate
+from moonteam.terrain import dem, generate
 from moonteam.terrain.surface import Surface
 
 SPACING = 0.25
@@ -37,9 +37,6 @@ how far it strays.
 
 MAX_SAMPLES = 1_500_000
 """Largest number of elevation samples in a site."""
-
-MAX_MISSING = 0.05
-"""Largest share of an elevation model's window without data."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +148,7 @@ def import_dem(
     centre_m: tuple[float, float] = (0.0, 0.0),
     pixel_m: float | None = None,
     band: int = 0,
-    scale: float = 1.0,
+    scale: float | None = None,
     detrend: bool = False,
     detail: bool = True,
     spacing: float = SPACING,
@@ -160,12 +157,13 @@ def import_dem(
     """Ground from an elevation model, GeoTIFF or `.npy`. Boulders are not added.
 
     Args:
-      path: the file. An .npy array is [rows, columns] m, row 0 in the north like a picture.
+      path: the file, see `dem.window`. An .npy array is [rows, columns] m, row 0 in the north
+        like a picture.
       extent_m: side, or (x, y) sides, of the window; None takes all of it.
       centre_m: the window's centre from the model's centre, m east and north.
       pixel_m: metres a pixel; needed for .npy and for a GeoTIFF that does not say.
       band: of a GeoTIFF, counted from 0.
-      scale: multiplies the elevations, for models not in metres.
+      scale: metres a unit of elevation; None: as the file says, else 1.
       detrend: takes out the plane of best fit, else only the mean.
       detail: adds relief finer than the model, continuing its power spectrum, where the model
         is coarser than the site and large enough to have one.
@@ -174,21 +172,23 @@ def import_dem(
 
     Raises InputError: not readable, no data, a scale that cannot be ground, a window outside.
     """
-    for name, value in (("scale", scale), ("centre", centre_m[0]), ("centre", centre_m[1])):
+    numbers = (("scale", 1.0 if scale is None else scale), ("centre", centre_m[0]),
+               ("centre", centre_m[1]))
+    for name, value in numbers:
         if not math.isfinite(value):
             raise InputError(path, f"{value} is not allowed; a finite number is needed", name)
-    heights, pixel = _read(path, band, pixel_m)
-    window = _window(path, heights * scale, pixel, extent_m, centre_m)
-    window = _fill_holes(path, window)
-    _check_relief(path, window, pixel)
-    window -= _plane(window) if detrend else window.mean()
-    sides = tuple((n - 1) * pixel for n in window.shape[::-1]) if extent_m is None else extent_m
+    found = dem.window(path, band=band, scale=scale, pixel_m=pixel_m, extent_m=extent_m,
+                       centre_m=centre_m)
+    pixel, core = found.pixel, found.core
+    dem.check_relief(path, core, pixel)
+    window = found.heights - (dem.plane(found.heights) if detrend else core.mean())
+    sides = tuple((n - 1) * pixel for n in core.shape[::-1]) if extent_m is None else extent_m
     shape = _shape(path, sides, spacing)
-    # The spectrum is the whole model's: a window has too few pixels to take one from.
-    fine = generate.spectrum(heights * scale, pixel) if detail and pixel > 2 * spacing else None
-    ground = generate.refine(window, pixel, shape, spacing, seed, fine)
+    # The spectrum is of more of the model: a window has too few pixels to take one from.
+    fine = generate.spectrum(found.about, pixel) if detail and pixel > 2 * spacing else None
+    ground = generate.refine(window, pixel, found.shift, shape, spacing, seed, fine)
     meta = {"dem": os.fspath(path), "pixel_m": pixel, "centre_m": list(centre_m), "band": band,
-            "scale": scale, "detrend": detrend, "detail": fine is not None}
+            "scale": found.scale, "detrend": detrend, "detail": fine is not None}
     return Site(Path(path).stem, seed, ground, spacing, meta=meta)
 
 
@@ -242,97 +242,3 @@ def _rock(radius: float, random: np.random.Generator) -> np.ndarray:
     corners = points * radius * random.uniform(0.97, 1.10, size=(count, 1))
     hull = trimesh.convex.convex_hull(corners)
     return np.array(hull.vertices)
-
-
-def _read(path: str | os.PathLike[str], band: int, pixel_m: float | None
-          ) -> tuple[np.ndarray, float]:
-    """Elevations, row 0 in the south, NaN where there is no data, and metres a pixel."""
-    if not Path(path).is_file():
-        raise InputError(path, "no such file")
-    if Path(path).suffix.lower() == ".npy":
-        try:
-            heights, pixel, metric = np.load(path, allow_pickle=False), math.nan, True
-        except (ValueError, OSError, EOFError):
-            raise InputError(path, "is not a NumPy array file") from None
-        if heights.ndim != 2 or heights.dtype.kind not in "fiu":
-            raise InputError(path, f"holds {heights.dtype} of shape {heights.shape}; "
-                             "numbers [rows, columns] are needed")
-        heights = heights[::-1].astype(np.float64)
-    else:
-        try:
-            heights, pixel, metric = generate.read_dem(path, band)
-        except ValueError as error:
-            raise InputError(path, str(error)) from None
-    if not metric:
-        raise InputError(path, "is in degrees of longitude and latitude; project it to metres")
-    if pixel_m is None and not math.isfinite(pixel):
-        raise InputError(path, "does not say how many metres a pixel is; give it", "pixel_m")
-    pixel = pixel if pixel_m is None else pixel_m
-    if not 0.01 <= pixel <= 1000:
-        raise InputError(path, f"{pixel:g} m a pixel is not allowed; 0.01 to 1000", "pixel_m")
-    return heights, pixel
-
-
-def _window(path: str | os.PathLike[str], heights: np.ndarray, pixel: float,
-            extent_m: float | tuple[float, float] | None, centre_m: tuple[float, float]
-            ) -> np.ndarray:
-    """The pixels of the window, whose centre is kept to half a pixel."""
-    rows, columns = heights.shape
-    if min(rows, columns) < 4:
-        raise InputError(path, f"is too small: {columns} by {rows} pixels; at least 4 by 4")
-    if extent_m is None:
-        return heights.copy()
-    sides = extent_m if isinstance(extent_m, tuple) else (extent_m, extent_m)
-    if not all(math.isfinite(side) and side > 0 for side in sides):
-        raise InputError(path, f"{sides[0]:g} by {sides[1]:g} m is not allowed", "size")
-    slices = []
-    for name, count, side, at in zip(("wide", "high"), (columns, rows), sides, centre_m,
-                                     strict=True):
-        middle = (count - 1) / 2 + at / pixel
-        reach = side / 2 / pixel
-        first, last = math.floor(middle - reach), math.ceil(middle + reach)
-        if first < 0 or last > count - 1:
-            raise InputError(path, f"is too small: it is {(count - 1) * pixel:g} m {name}, the "
-                             f"window needs {side:g} m around {at:g} m from the centre")
-        slices.append(slice(first, last + 1))
-    window = heights[slices[1], slices[0]].copy()
-    if min(window.shape) < 4:
-        raise InputError(path, f"is too coarse: the window spans {window.shape[1]} by "
-                         f"{window.shape[0]} pixels of {pixel:g} m; at least 4 by 4")
-    return window
-
-
-def _fill_holes(path: str | os.PathLike[str], window: np.ndarray) -> np.ndarray:
-    """Small holes take the mean of their surroundings, from the edge inwards."""
-    missing = ~np.isfinite(window)
-    share = missing.mean()
-    if share > MAX_MISSING:
-        raise InputError(path, f"has no data in {100 * share:.0f} % of the window; at most "
-                         f"{100 * MAX_MISSING:.0f} %")
-    while missing.any():
-        padded = np.pad(window, 1, constant_values=np.nan)
-        around = np.stack([padded[1 + dy:1 + dy + len(window), 1 + dx:1 + dx + window.shape[1]]
-                           for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-        known = np.isfinite(around)
-        mean = np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        reached = missing & known.any(axis=0)
-        window[reached] = mean[reached]
-        missing &= ~reached
-    return window
-
-
-def _check_relief(path: str | os.PathLike[str], window: np.ndarray, pixel: float) -> None:
-    """Raises InputError where elevations cannot be metres of ground."""
-    relief, width = float(np.ptp(window)), pixel * (min(window.shape) - 1)
-    if not np.isfinite(relief) or relief > width:
-        raise InputError(path, f"rises {relief:g} m within {width:g} m: elevations or pixels "
-                         "are not in metres (see scale and pixel_m)")
-
-
-def _plane(window: np.ndarray) -> np.ndarray:
-    """The plane of best fit, sampled like the window."""
-    y, x = (np.arange(n) - (n - 1) / 2 for n in window.shape)
-    # The axes are centred, so the three coefficients are independent.
-    gx = (window * x[None, :]).sum() / (x**2).sum() / len(y)
-    gy = (window * y[:, None]).sum() / (y**2).sum() / len(x)
-    return window.mean() + gx * x[None, :] + gy * y[:, None]
