@@ -114,8 +114,8 @@ def test_a_scenario_of_a_set(files, capsys, tmp_path):
 
 
 BAD = {
-    "{": "not JSON: Expecting property name",
-    "": "not JSON: Expecting value (line 1, column 1)",
+    "{": "is not JSON: Expecting property name",
+    "": "is not JSON: Expecting value (line 1, column 1)",
     "7": "a list of steps is needed",
     '{"steps": []}': 'an object needs the key "actions"',
     '[["up"]]': "[0]: 1 actions for 2 agents",

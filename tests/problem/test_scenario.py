@@ -40,7 +40,7 @@ def test_a_bad_row_is_named_by_its_line(tmp_path, change, expected):
 def test_broken_json_and_empty_sets(tmp_path):
     path = tmp_path / "set.jsonl"
     path.write_text(GOLDEN.read_text().splitlines()[0] + "\n{\n")
-    with pytest.raises(InputError, match="line 2: not JSON"):
+    with pytest.raises(InputError, match="line 2: is not JSON"):
         scenario.load_set(path)
     path.write_text("\n\n")
     with pytest.raises(InputError, match="holds no scenario"):

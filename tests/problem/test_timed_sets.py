@@ -50,7 +50,7 @@ def test_load_tells_the_clock_from_steps(tmp_path):
     ((STEPS, "", CLOCKED), "line 3: is by the clock, the first in steps"),
     ((CLOCKED, {**CLOCKED, "speed": 1}), "line 2: unknown key `speed`"),
     ((CLOCKED, {**CLOCKED, "targets": []}), "line 2.targets: at least one"),
-    ((CLOCKED, '{"clock": "seconds", '), "line 2: not JSON"),
+    ((CLOCKED, '{"clock": "seconds", '), "line 2: is not JSON"),
     (({**CLOCKED, "clock": "minutes"},), "line 1.clock"),
 ])
 def test_a_wrong_line_is_named(tmp_path, values, said):

@@ -73,7 +73,7 @@ def optimum(task: GridTask, key: Array, num_scenarios: int) -> float | None:
     None where it is not known: targets that appear later, or more than `EXACT_TO`.
     """
     config = task.config
-    if config.replanning or config.num_targets > EXACT_TO:
+    if config.num_buffer or config.num_targets > EXACT_TO:
         return None
     state = jax.device_get(task.reset(jax.random.split(key)[0], num_scenarios).world)
     problem = state.problem

@@ -3,12 +3,17 @@
 import sys
 from io import StringIO
 
+import jax
 import numpy as np
 import pytest
 
+from moonteam.grid.config import EnvConfig
+from moonteam.planners.base import Snapshot
+from moonteam.planners.exact import ExactPlanner
 from moonteam.report.progress import bar
 from training.mappo.config import PRESETS
-from training.mappo.held_out import collapsed
+from training.mappo.grid_task import GridTask
+from training.mappo.held_out import collapsed, optimum
 from training.mappo.trainee import Mappo
 
 SCORE = {"success": 0.987, "makespan": 113.62, "moves": 26.5}
@@ -72,3 +77,20 @@ def test_no_false_alarm_in_normal_learning():
         for ability in (0.3, 0.5, 0.7, 0.95):
             noisy = looks(*(draw.binomial(scenarios, ability, 400) / scenarios))
             assert not any(collapsed(noisy[:n], scenarios) for n in range(1, 401, 3))
+
+
+def test_the_optimum_is_that_of_the_scenarios_that_are_played():
+    """Against the exact planner, scenario by scenario; none where it is not known."""
+    config = EnvConfig(num_agents=2, num_targets=3, width=9, height=7)
+    key, count = jax.random.key(3), 6
+    world = jax.device_get(GridTask(config).reset(jax.random.split(key)[0], count).world)
+    spans = []
+    for b in range(count):
+        state = jax.tree.map(lambda x, b=b: x[b], world)
+        p = state.problem
+        spans.append(ExactPlanner().plan(Snapshot(
+            (9, 7), state.cells, p.agent_skills, p.agent_kinds, p.agent_mask, p.target_cells,
+            p.target_skills, p.target_and, state.solved)).makespan)
+    assert optimum(GridTask(config), key, count) == np.mean(spans)
+    assert optimum(GridTask(EnvConfig(num_buffer=5)), key, count) is None
+    assert optimum(GridTask(EnvConfig(num_targets=9)), key, count) is None

@@ -88,7 +88,7 @@ def test_a_resumed_run_is_the_same_run(tmp_path, monkeypatch):
     learners = [jax.tree.leaves(run.trainee.learner) for run in (whole, again)]
     for a, b in zip(*learners, strict=True):
         np.testing.assert_array_equal(a, b)
-    assert again.finish()["method"] == "MAPPO from imitation, reward regret"
+    assert again.finish()["method"] == "MAPPO from imitation, reward regret, leash 0.1"
 
 
 SMALLER = ("from training.teacher import pupil; pupil.SCENARIOS = 8; "
