@@ -108,6 +108,25 @@ def test_all_serve_who_set_out_and_the_last_service_ends_the_episode(policy, man
     assert len({found.order[0, k].tobytes() for k in range(8)}) > 1
 
 
+def test_each_of_several_tries_is_cooler_where_targets_are_many(policy, many, monkeypatch):
+    """The hottest and the coolest are those of a call at their temperature alone."""
+    alone = {heat: macro.rollouts(policy, many, tries=6, heat=heat).order for heat in (4.0, 1.0)}
+    few = macro.rollouts(policy, many, tries=6, heat=4.0, cooling=True).order
+    np.testing.assert_array_equal(few, alone[4.0])
+    monkeypatch.setattr(macro, "coolest", lambda mask: jnp.full(mask.shape[:-1], 0.25))
+    macro._play.clear_cache()
+    row = macro.rollouts(policy, many, tries=6, heat=4.0, cooling=True).order
+    macro._play.clear_cache()
+    for heat, attempt in ((4.0, 0), (4.0, 1), (1.0, 5)):
+        np.testing.assert_array_equal(row[:, attempt], alone[heat][:, attempt])
+    assert (row[:, 5] != alone[4.0][:, 5]).any()
+
+
+@pytest.mark.parametrize(("count", "share"), [(0, 1.0), (8, 1.0), (16, 0.25), (40, 0.05)])
+def test_the_more_targets_the_cooler(count, share):
+    assert macro.coolest(jnp.arange(50) < count) == pytest.approx(share)
+
+
 def test_a_seed_draws_the_same_whatever_the_pool(policy, many, monkeypatch):
     whole = macro.rollouts(policy, many, tries=8, heat=2.0, seed=1)
     monkeypatch.setattr(macro, "_PLACES", 3)

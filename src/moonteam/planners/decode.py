@@ -38,6 +38,12 @@ class Decode:
         return 0.0 if not self.sample else self.temperature if "@" in self.asked else HELD
 
 
+    @property
+    def cooling(self) -> bool:
+        """Whether several tries are cooler one by one, see `macro.rollouts`: none is asked for."""
+        return self.rollouts > 1 and "@" not in self.asked
+
+
 HELD = 1.0
 """Temperature at which choices of targets are drawn, which are few and held; `SAMPLING` is that
 of the many steps of a stepwise policy."""

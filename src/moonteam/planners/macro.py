@@ -35,6 +35,8 @@ from moonteam.policies.policy import Policy
 
 _PLACES = 256
 _PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of the network holds
+FEW = 8.0
+"""Targets up to which all tries of a problem are as hot as asked for."""
 _CHUNK = 4096  # episodes of a call, more only if one problem's tries are
 _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": "NS",
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
@@ -120,7 +122,7 @@ def unit_of(start: npt.NDArray, has: npt.NDArray, need: npt.NDArray) -> np.float
 
 
 def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: float = 0.0,
-             seed: int = 0, preference: float = 0.0,
+             cooling: bool = False, seed: int = 0, preference: float = 0.0,
              tick: Callable[[int], object] = lambda episodes: None) -> Rollouts:
     """Plays every problem `tries` times from its beginning to its end.
 
@@ -134,6 +136,8 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
       tries: K.
       heat: temperature at which choices are drawn, but for the first of several tries, which
         takes the likeliest; 0: all of them do.
+      cooling: of a problem with more than `FEW` targets each try is cooler than the one before
+        it, the more targets the cooler, see `coolest`.
       seed: of the draws.
       preference: 0 time .. 1 effort.
       tick: told how many episodes have ended, now and then.
@@ -148,7 +152,7 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
     parts = []
     for first in range(0, count, play.rows):
         real = min(play.rows, count - first)
-        done = play(problems, first, real, heat, seed, preference)
+        done = play(problems, first, real, heat, cooling, seed, preference)
         parts.append(jax.tree.map(
             lambda x, n=real: x.reshape(play.rows, tries, *x.shape[1:])[:n], done))
         tick(real * tries)
@@ -158,7 +162,7 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
 
 def warm(policy: Policy, problems: MacroProblem, tries: int = 1) -> None:
     """Compiles what `rollouts` of problems of these shapes needs, and plays nothing."""
-    _Call.of(policy, problems, tries)(problems, 0, 0, 0.0, 0, 0.0)
+    _Call.of(policy, problems, tries)(problems, 0, 0, 0.0, False, 0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -179,13 +183,14 @@ class _Call:
         places = max(1, min(_PLACES, _PAIRS // (agents + targets) ** 2, rows * tries))
         return cls(spec, policy.params, tries, rows, places)
 
-    def __call__(self, problems: MacroProblem, first: int, real: int, heat: float, seed: int,
-                 preference: float) -> _Done:
+    def __call__(self, problems: MacroProblem, first: int, real: int, heat: float, cooling: bool,
+                 seed: int, preference: float) -> _Done:
         """Plays `real` problems from number `first` on; NumPy arrays."""
         index = np.minimum(np.arange(first, first + self.rows), len(problems.limit) - 1)
         done = _play(self.spec, self.params, jax.tree.map(lambda x: x[index], problems),
                      np.int32(real * self.tries), np.int32(first), np.float32(heat),
-                     np.uint32(seed % 2**32), np.float32(preference), self.tries, self.places)
+                     np.bool_(cooling), np.uint32(seed % 2**32), np.float32(preference),
+                     self.tries, self.places)
         return jax.device_get(done)
 
 
@@ -209,7 +214,8 @@ class _Pool(NamedTuple):
 
 @partial(jax.jit, static_argnames=("spec", "tries", "places"))
 def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, first: Array,
-          heat: Array, seed: Array, preference: Array, tries: int, places: int) -> _Done:
+          heat: Array, cooling: Array, seed: Array, preference: Array, tries: int,
+          places: int) -> _Done:
     """The first `count` of the episodes [F]; `first` is the number of the first problem."""
     rows = problems.limit.shape[0]
     agents, targets = problems.start.shape[1:]
@@ -235,7 +241,9 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
         view = jax.vmap(pointer.look)(state, likings)
         logits = pointer.point(params, spec, view).logits
         first_try = (pool.episode % tries == 0) & (tries > 1)
-        warm = jnp.where(first_try, 0.0, heat)[:, None, None]
+        share = jnp.maximum(pool.episode % tries - 1, 0) / max(tries - 2, 1)
+        warm = heat * jnp.where(cooling, coolest(state.problem.target_mask) ** share, 1.0)
+        warm = jnp.where(first_try, 0.0, warm)[:, None, None]
         drawn = warm * jax.vmap(noise)(pool.episode, pool.turn)
         choice, _ = jax.vmap(world.choose)(state, logits, drawn)
         result = jax.vmap(world.step)(state, choice)
@@ -257,6 +265,15 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
     begun = _Pool(everyone, fresh(everyone), jnp.zeros(places, jnp.int32), blank(places),
                   blank(rows * tries), jnp.int32(places))
     return jax.lax.while_loop(lambda pool: jnp.any(pool.episode < count), decide, begun).done
+
+
+def coolest(target_mask: Array) -> Array:
+    """[...] temperature of the last of several tries, as a share of the first's; mask [..., M].
+
+    Of few targets only hot tries are different plans, of many only cool ones are good plans.
+    """
+    count = jnp.maximum(jnp.sum(target_mask, axis=-1), 1)
+    return jnp.clip((FEW / count) ** 2, 0.05, 1.0)
 
 
 def refilled(over: Array, held: Array, following: Array) -> tuple[Array, Array]:

@@ -94,8 +94,9 @@ class PointingPlanner(RoutePlanner):
                  tick: Callable[[int], object] = lambda episodes: None) -> macro.Rollouts:
         """K tries of every task."""
         problems = macro.stacked([problem_of(task) for task in tasks])
-        return macro.rollouts(self.policy, problems, tries=self.decode.rollouts, heat=self.heat,
-                              seed=self.seed, preference=self.preference, tick=tick)
+        return macro.rollouts(
+            self.policy, problems, tries=self.decode.rollouts, heat=self.heat,
+            cooling=self.decode.cooling, seed=self.seed, preference=self.preference, tick=tick)
 
     def warm(self, tasks: Sequence[Task]) -> None:
         """Compiles what `rollouts` of such tasks needs."""

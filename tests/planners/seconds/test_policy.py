@@ -20,11 +20,13 @@ def policy(pointing):
     return Policy.load(pointing)
 
 
-@pytest.mark.parametrize(("decode", "heat"), [
-    ("argmax", 0.0), ("best-of-4", 1.0), ("best-of-4@0.5", 0.5), ("sample@2", 2.0)])
-def test_the_temperature_asked_for_reaches_the_planner(pointing, decode, heat):
+@pytest.mark.parametrize(("decode", "heat", "cooling"), [
+    ("argmax", 0.0, False), ("best-of-4", 1.0, True), ("best-of-4@0.5", 0.5, False),
+    ("best-of-1", 1.0, False), ("sample", 1.0, False), ("sample@2", 2.0, False)])
+def test_the_temperatures_asked_for_reach_the_planner(pointing, decode, heat, cooling):
+    """Of several tries each is cooler than the one before, unless a temperature is asked for."""
     rows = timed.contenders(Options(["policy"], policies=[pointing], decodes=(decode,)))
-    assert [row.planner.heat for row in rows] == [heat]
+    assert [(row.planner.heat, row.planner.cooling) for row in rows] == [(heat, cooling)]
 
 
 def planner(policy, **options):

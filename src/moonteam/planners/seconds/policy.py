@@ -51,7 +51,7 @@ class PolicyPlanner:
         self.policy: Policy = options.loaded()
         macro.spec_of(self.policy)
         self.tries, self.seed = decoding.rollouts, options.seed
-        self.heat = decoding.heat
+        self.heat, self.cooling = decoding.heat, decoding.cooling
         self.preference = options.preference
         word, *_ = meaning(options)
         self.objective: Objective = "effort" if word == "moves" else word
@@ -66,7 +66,8 @@ class PolicyPlanner:
         began = time.perf_counter()
         played = macro.rollouts(
             self.policy, macro.stacked([problem_of(moment) for moment in moments]),
-            tries=self.tries, heat=self.heat, seed=self.seed, preference=self.preference)
+            tries=self.tries, heat=self.heat, cooling=self.cooling, seed=self.seed,
+            preference=self.preference)
         found = [self._best(moment, played, b) for b, moment in enumerate(moments)]
         share = (time.perf_counter() - began) / max(len(moments), 1)
         return [self._plan(moment, services, share)
