@@ -298,3 +298,10 @@ def test_bench_measures_planner_and_env(capsys, monkeypatch, tmp_path):
     assert document["env"]["ratio"] is None
     assert any("not installed" in note for note in document["notes"])
     assert main(["bench", "grid", "--targets", "13"]) == 2
+
+
+def test_without_a_name_all_bundled_sets_in_steps_are_evaluated(capsys):
+    assert main(["evaluate", "sets", "--planner", "greedy", "--limit", "1", "--json"]) == 0
+    found = [row["planner"] for row in json.loads(capsys.readouterr().out)["summary"]]
+    assert len(found) == 16
+    assert (found[0], found[-1]) == ("2x3", "8x40")

@@ -3,9 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from moonteam import files
 from training.run.trainee import Row
+
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
+
+
+def logarithmic(axis: Axis, form: Any) -> None:
+    """Ticks at 1, 2 and 5 of each decade, written by `form`, and none between them."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(form)
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_gap(path: Path, groups: dict[str, list[list[Row]]]) -> None:
@@ -36,11 +49,10 @@ def draw_gap(path: Path, groups: dict[str, list[list[Row]]]) -> None:
         axis.set_xlabel("minutes of training")
         axis.set_xscale("log")
         axis.grid(alpha=0.3, which="both")
-        axis.xaxis.set_major_formatter("{x:g}")
+        logarithmic(axis.xaxis, "{x:g}")
     axes[0].yaxis.set_major_formatter(PercentFormatter(1.0))
     axes[1].set_yscale("log")
-    for which in (axes[1].yaxis.set_major_formatter, axes[1].yaxis.set_minor_formatter):
-        which(PercentFormatter(1.0, decimals=0))
+    logarithmic(axes[1].yaxis, PercentFormatter(1.0, decimals=0))
     figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, ncols=2,
                   loc="outside lower center")
     with files.replacing(path) as temporary:

@@ -86,9 +86,10 @@ def run(args: Args) -> int:
 
 
 def _bundled() -> list[str]:
-    """Names of all bundled sets, small ones first."""
+    """Names of all bundled sets in steps, small ones first; those in folders are by the clock."""
     index = msgspec.json.decode(paths.find("index", "testsets", ".json").read_bytes())
-    return sorted(index, key=lambda name: (index[name]["targets"], index[name]["agents"]))
+    return sorted((name for name in index if "/" not in name),
+                  key=lambda name: (index[name]["targets"], index[name]["agents"]))
 
 
 def _who(args: Args) -> list[Who]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from moonteam import files
+from training.run.curve import logarithmic
 from training.run.trainee import Row
 
 
@@ -46,12 +47,11 @@ def draw_curve(path: Path, groups: dict[str, list[list[Row]]]) -> None:
         axis.set_xlabel("minutes of training")
         axis.set_xscale("log")
         axis.grid(alpha=0.3, which="both")
-        axis.xaxis.set_major_formatter("{x:g}")
+        logarithmic(axis.xaxis, "{x:g}")
     axes[0].yaxis.set_major_formatter(PercentFormatter(1.0))
     axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.98), 1.001)
     axes[1].set_yscale("log")
-    for which in (axes[1].yaxis.set_major_formatter, axes[1].yaxis.set_minor_formatter):
-        which(PercentFormatter(1.0, decimals=0))
+    logarithmic(axes[1].yaxis, PercentFormatter(1.0, decimals=0))
     figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, ncols=4,
                   loc="outside lower center")
     with files.replacing(path) as temporary:
