@@ -198,7 +198,8 @@ def table(document: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         line("MFLOP an env step", lambda side: f"{side['flops_per_env_step'] / 1e6:.2f}"),
         line("GFLOP/s", lambda side: f"{side['achieved_gflops']:.1f}"),
         line("compiled (or read from the cache) in, s", lambda side: f"{side['compile_s']:.1f}"),
-        line("arrays of the program, MiB", lambda side: f"{side['compiled_bytes'] / 2**20:,.0f}"),
+        line("arrays of the program, MiB", lambda side: f"{side['compiled_bytes'] / 2**20:,.0f}"
+             if side["compiled_bytes"] else "-"),
         line("peak of the " + sides[0]["peak_of"] + ", MiB",
              lambda side: f"{side['peak_bytes'] / 2**20:,.0f}"),
         line("devices", lambda side: side["device"])]
