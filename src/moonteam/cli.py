@@ -14,6 +14,7 @@ import os
 import sys
 from typing import Any
 
+from moonteam import compilation
 from moonteam.errors import InputError
 from moonteam.version import __version__
 
@@ -134,14 +135,9 @@ def _surroundings() -> str | None:
     renderer, platforms = os.environ.get("MUJOCO_GL", ""), os.environ.get("JAX_PLATFORMS", "")
     if renderer and "mujoco" not in sys.modules and renderer.lower() not in RENDERERS:
         return f"MUJOCO_GL: {renderer!r} is not allowed; one of: {', '.join(RENDERERS)}"
-    if platforms and "jax" in sys.modules:
-        import jax
-
-        try:
-            jax.devices()
-        except (AssertionError, RuntimeError):
-            return (f"JAX_PLATFORMS: there is no device of {platforms!r} here; unset it, or set it "
-                    "to cpu")
+    if platforms and "jax" in sys.modules and not compilation.devices():
+        return (f"JAX_PLATFORMS: there is no device of {platforms!r} here; unset it, or set it to "
+                "cpu")
     return None
 
 

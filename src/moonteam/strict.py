@@ -118,15 +118,19 @@ def yaml_value(text: str, source: object) -> Any:
         _check(node)
         return loader.construct_document(node)
     except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" (line {mark.line + 1})" if mark else ""
         problem = getattr(error, "problem", error)
-        raise InputError(source, f"is not YAML: {problem}{where}") from None
+        raise InputError(source, f"is not YAML: {problem}{line_of(error)}") from None
     except RecursionError:
         raise InputError(source, DEEP) from None
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def line_of(error: yaml.YAMLError) -> str:
+    """Where it is, in words to put behind others; empty if it does not say."""
+    mark = getattr(error, "problem_mark", None)
+    return f" (line {mark.line + 1})" if mark else ""
 
 
 def _check(root: yaml.Node) -> None:

@@ -18,7 +18,6 @@ from training.bench.measure import Wanted, matmul_peak, peak_bytes, seconds
 
 if TYPE_CHECKING:
     from training.mappo.macro.config import MacroConfig
-    from training.mappo.macro.trainee import MacroMappo
 
 
 def products(work: Callable[..., Any], *args: Any) -> int:
@@ -75,8 +74,8 @@ def flops(chosen: MacroConfig) -> float:
     return once * (1.0 + 3.0 * hyper.epochs * hyper.learned)
 
 
-def build(chosen: MacroConfig) -> tuple[MacroMappo, Callable[[], Any], float]:
-    """A run ready to improve, one update of it, and the seconds that compiling took.
+def build(chosen: MacroConfig) -> tuple[Callable[[], Any], float]:
+    """One update of a run, which gives its report, and the seconds that compiling took.
 
     The seconds hold one update: what is compiled is what training runs.
     """
@@ -94,7 +93,7 @@ def build(chosen: MacroConfig) -> tuple[MacroMappo, Callable[[], Any], float]:
         key = jax.random.fold_in(jax.random.key(1), next(rounds))
         return trainee.practise(0, chosen.families[0], key, np.float32(0.0), np.float32(0.01))
 
-    return trainee, once, seconds(once)
+    return once, seconds(once)
 
 
 def measure(args: Wanted, command: str) -> dict[str, Any]:
@@ -108,7 +107,7 @@ def measure(args: Wanted, command: str) -> dict[str, Any]:
     rows = []
     for advantages in ("vine", "critic"):
         chosen = config(args.preset, advantages)
-        trainee, once, first = build(chosen)
+        once, first = build(chosen)
         took = min(seconds(once) for _ in range(args.repeats))
         rows.append({"advantages": advantages, "decisions": chosen.decisions, "seconds": took,
                      "decisions_per_s": chosen.decisions / took, "first_s": first})
@@ -118,10 +117,9 @@ def measure(args: Wanted, command: str) -> dict[str, Any]:
             work = flops(chosen)
             rows[-1] |= {"flops_per_decision": work,
                          "achieved_gflops": work * chosen.decisions / took / 1e9}
-        del trainee
     peak, peak_of = peak_bytes()
     best, critic = matmul_peak("float32") / 1e9, rows[-1]
-    return {"title": f"{args.preset}, {config(args.preset, 'vine').families[0].name}",
+    return {"title": f"{args.preset}, {chosen.families[0].name}",
             "preset": args.preset, "rows": rows, "matmul_peak_gflops": best, "peak_bytes": peak,
             "peak_of": peak_of, "repeats": args.repeats, "device": sharding.describe_device(),
             "meta": provenance.meta(command, 0), "notes": [

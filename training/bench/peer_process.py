@@ -125,7 +125,7 @@ def macro(load: Load) -> Built:
     from training.bench import macro as bench
 
     chosen = bench.config(load.preset, "critic")
-    _, once, first = bench.build(chosen)
+    once, first = bench.build(chosen)
     row = {"device": sharding.describe_device(), "compile_s": first, "compiled_bytes": 0,
            "begin_s": 0.0, "steps": chosen.decisions, "flops": bench.flops(chosen), "notes": [
                f"{chosen.families[0].name}; {chosen.num_envs} environments x "

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam import trees
-from moonteam.planners.batch import OPTIMAL, solve_batch
+from moonteam.planners.batch import OPTIMAL
 from training.mappo.grid_task import GridTask
 from training.mappo.networks import Networks
 from training.mappo.task import EnvState, Task
+from training.optima import plans
 
 HELD_OUT_SEED = 715517
 """Keys of held-out scenarios descend from this seed, those of training from the run's."""
@@ -76,12 +77,9 @@ def optimum(task: GridTask, key: Array, num_scenarios: int) -> float | None:
     if config.num_buffer or config.num_targets > EXACT_TO:
         return None
     state = jax.device_get(task.reset(jax.random.split(key)[0], num_scenarios).world)
-    problem = state.problem
-    plans = solve_batch(state.cells, problem.agent_skills, problem.target_cells,
-                        problem.target_skills, problem.target_and, solved=state.solved,
-                        agent_mask=problem.agent_mask, steps_left=1024, objective="makespan")
-    assert (plans.status == OPTIMAL).all()
-    return float(plans.makespan.mean())
+    best = plans(state, objective="makespan")
+    assert (best.status == OPTIMAL).all()
+    return float(best.makespan.mean())
 
 
 STANDING = 0.5

@@ -19,10 +19,11 @@ from moonteam import trees
 from moonteam.grid import env, scenarios, travel
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.types import State
-from moonteam.planners.batch import BatchPlans, solve_batch
+from moonteam.planners.batch import BatchPlans
 from moonteam.planners.exact import MAX_TARGETS
 from moonteam.policies.entity import Entities, look
 from training.mappo.macro.grounds import blocked
+from training.optima import plans
 from training.sharding import everywhere, spread
 
 TIE_BREAK = 0.05
@@ -167,11 +168,7 @@ def renew(family: Family, ground: Ground | None, key: Array, walk: Walk, ended: 
 def solve(family: Family, ground: Ground | None, states: State, place: np.ndarray,
           preference: np.ndarray, threads: int | None = None) -> BatchPlans:
     """Exact or good plans of states [B], host arrays, at their preference."""
-    problem = states.problem
-    passable = None if ground is None else np.asarray(ground.passable)[place]
-    return solve_batch(
-        states.cells, problem.agent_skills, problem.target_cells, problem.target_skills,
-        problem.target_and, solved=states.solved, agent_mask=problem.agent_mask, steps_left=1024,
-        agent_kinds=problem.agent_kinds if ground is not None else None, passable=passable,
+    return plans(
+        states, None if ground is None else np.asarray(ground.passable)[place],
         objective="weighted", alpha=1.0 - preference + TIE_BREAK, beta=preference + TIE_BREAK,
         threads=threads, exact_to=family.exact_to, iterations=family.iterations)

@@ -15,9 +15,9 @@ import numpy as np
 from jax import Array
 
 from moonteam.grid import env
-from moonteam.planners.batch import solve_batch
 from moonteam.policies.entity import EntitySpec, decide
 from training.mappo.held_out import HELD_OUT_SEED
+from training.optima import plans
 from training.teacher.families import (
     Family,
     Ground,
@@ -82,16 +82,11 @@ class HeldOut:
                                   HELD_OUT_SEED)
         self.walk = begin(family, self.ground, jax.random.key(HELD_OUT_SEED), count)
         states, place = jax.device_get((self.walk.states, self.walk.place))
-        problem = states.problem
-        given = {"agent_kinds": problem.agent_kinds,
-                 "passable": np.asarray(self.ground.passable)[place]} if self.ground else {}
+        passable = np.asarray(self.ground.passable)[place] if self.ground else None
 
         def optimum(objective: Any) -> Any:
-            return solve_batch(
-                states.cells, problem.agent_skills, problem.target_cells, problem.target_skills,
-                problem.target_and, solved=states.solved, agent_mask=problem.agent_mask,
-                steps_left=1024, objective=objective, exact_to=self.family.exact_to,
-                iterations=10 * self.family.iterations, **given)
+            return plans(states, passable, objective=objective, exact_to=family.exact_to,
+                         iterations=10 * family.iterations)
 
         self.best_makespan = float(optimum("makespan").makespan.mean())
         self.best_moves = float(optimum("moves").moves.mean())

@@ -62,16 +62,6 @@ def rendering() -> tuple[bool, str]:
                    f"libgl1-mesa-dri libglx-mesa0 ({last})")
 
 
-def devices() -> list[dict[str, str]]:
-    """Those that JAX computes on; none where JAX_PLATFORMS asks for what is not there."""
-    import jax
-
-    try:
-        return [{"platform": d.platform, "kind": d.device_kind} for d in jax.devices()]
-    except (AssertionError, RuntimeError):
-        return []
-
-
 def examine() -> dict:
     """Everything the command reports, as a JSON-able document."""
     drawn, how = rendering()
@@ -86,7 +76,8 @@ def examine() -> dict:
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "packages": versions(),
-        "devices": devices(),
+        "devices": [{"platform": d.platform, "kind": d.device_kind}
+                    for d in compilation.devices()],
         "rendering": {"works": drawn, "note": how},
         "ffmpeg": video,
         "cache": str(compilation.cache_folder()),

@@ -91,7 +91,7 @@ def _array(path: Named, pixel_m: float | None, extent_m: Any, centre_m: tuple[fl
     if heights.ndim != 2 or heights.dtype.kind not in "fiu":
         raise InputError(path, f"holds {heights.dtype} of shape {heights.shape}; "
                          "numbers [rows, columns] are needed")
-    pixel = _pixel(path, math.nan if pixel_m is None else pixel_m)
+    pixel = _pixel(path, pixel_m)
 
     def part(rows: slice, columns: slice) -> Heights:
         return heights[::-1][rows, columns].astype(np.float64) * scale
@@ -99,8 +99,8 @@ def _array(path: Named, pixel_m: float | None, extent_m: Any, centre_m: tuple[fl
     return _straight(path, part, heights.shape, pixel, extent_m, centre_m, scale)
 
 
-def _pixel(path: Named, pixel: float) -> float:
-    if not math.isfinite(pixel):
+def _pixel(path: Named, pixel: float | None) -> float:
+    if pixel is None or not math.isfinite(pixel):
         raise InputError(path, "does not say how many metres a pixel is (0.01 to 1000); give it",
                          "pixel_m")
     if not 0.01 <= pixel <= 1000:
@@ -197,11 +197,11 @@ def _grid(path: Named, source: Any, pixel_m: float | None) -> _Grid:
         raise InputError(path, "is tied to the ground by control points; resample it first, such "
                          f"as by: gdalwarp -r cubic {Path(path).name} straight.tif")
     if move.is_identity:
-        side = _pixel(path, math.nan if pixel_m is None else pixel_m)
+        side = _pixel(path, pixel_m)
         return _Grid((side, 0.0), (0.0, -side))
     factor = 1.0 if crs is None else _linear(path, crs)
     grid = _Grid((move.a * factor, move.d * factor), (move.b * factor, move.e * factor))
-    if min(grid.wide, grid.high) <= 0 or abs(move.determinant) <= 1e-12 * abs(
+    if min(grid.wide, grid.high) <= 0 or abs(move.determinant) <= 1e-12 * (
             math.hypot(move.a, move.d) * math.hypot(move.b, move.e)):
         raise InputError(path, "has pixels without an area")
     if pixel_m is not None:  # as wide as that; their shape stays

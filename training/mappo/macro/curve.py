@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from moonteam import files
-from training.run.curve import logarithmic
+from training.run.curve import TITLES, over_minutes
 from training.run.trainee import Row
 
 
@@ -18,19 +18,16 @@ def draw_curve(path: Path, groups: dict[str, list[list[Row]]]) -> None:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import PercentFormatter
 
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)
     runs = [rows for group in groups.values() for rows in group]
-    titles = {"success": "success, argmax", "makespan_gap": "makespan over the optimum, argmax",
-              "entropy": "entropy of a choice"}
     for index, (name, group) in enumerate(groups.items()):
         for number, rows in enumerate(group):
             looks = [row for row in rows if "families" in row and row["seconds"] > 0]
             minutes = [row["seconds"] / 60 for row in looks]
-            for axis, key in zip(axes[:2], titles, strict=False):
+            for axis, key in zip(axes[:2], ("success", "makespan_gap"), strict=True):
                 table = np.array([[f[key] for f in row["families"]] for row in looks])
                 if len(runs) == 1:
                     for i, family in enumerate(looks[-1]["families"]):
@@ -42,16 +39,8 @@ def draw_curve(path: Path, groups: dict[str, list[list[Row]]]) -> None:
             made = [row for row in rows if "entropy" in row]
             axes[2].plot([row["seconds"] / 60 for row in made], [row["entropy"] for row in made],
                          color=f"C{index}" if len(runs) > 1 else "0.3")
-    for axis, title in zip(axes, titles.values(), strict=True):
-        axis.set_title(title)
-        axis.set_xlabel("minutes of training")
-        axis.set_xscale("log")
-        axis.grid(alpha=0.3, which="both")
-        logarithmic(axis.xaxis, "{x:g}")
-    axes[0].yaxis.set_major_formatter(PercentFormatter(1.0))
+    over_minutes(axes, (*TITLES, "entropy of a choice"))
     axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.98), 1.001)
-    axes[1].set_yscale("log")
-    logarithmic(axes[1].yaxis, PercentFormatter(1.0, decimals=0))
     figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, ncols=4,
                   loc="outside lower center")
     with files.replacing(path) as temporary:

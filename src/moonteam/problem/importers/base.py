@@ -15,6 +15,7 @@ import yaml
 from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem.timed import Place, Timed
+from moonteam.strict import line_of
 
 T = TypeVar("T")
 
@@ -63,9 +64,7 @@ def read_yaml(path: Path) -> Any:
     try:
         return yaml.load(files.read_text(path), Loader=loader)
     except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" (line {mark.line + 1})" if mark else ""
-        raise InputError(path, f"is not YAML{where}") from None
+        raise InputError(path, f"is not YAML{line_of(error)}") from None
 
 
 def entry(value: Any, path: Path, *keys: str | int, kind: type[T] | Any = Any) -> T:
