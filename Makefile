@@ -9,7 +9,7 @@ STAMP := .venv/.installed
 .PHONY: demo test soak lint check wheel clean
 
 demo: $(STAMP)
-	$(BIN)/moonteam rollout outpost --planner policy --out runs/demo
+	$(BIN)/moonteam rollout outpost --planner policy --out runs/demo --force
 	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.html"
 
 test: $(STAMP)

@@ -79,10 +79,11 @@ def test_doctor_says_that_there_is_no_such_device():
 def test_a_full_disk_and_a_file_in_the_way(tmp_path):
     file = tmp_path / "file"
     file.write_text("mine")
-    for out, problem in ((file / "run", "Not a directory"), (file, "File exists")):
+    for out, line in ((file / "run", f"{file}/run: Not a directory"),
+                      (file, f"--out: {file} is a file; a folder is needed")):
         done = moonteam("plan", "outpost", "--planner", "exact", "--out", str(out))
         assert done.returncode == 2
-        assert done.stderr.splitlines()[-1] == f"moonteam: {out}: {problem}"
+        assert done.stderr.splitlines()[-1] == f"moonteam: {line}"
     assert file.read_text() == "mine"
     with open("/dev/full", "w") as full:
         done = subprocess.run([sys.executable, "-m", "moonteam.cli", "--help"], stdout=full,

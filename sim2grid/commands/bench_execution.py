@@ -13,6 +13,9 @@ from moonteam.errors import InputError
 if TYPE_CHECKING:
     from sim2grid.loop.fused.deciders import Decider
 
+FILES = ("bench_execution.json", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Missions, Reported):

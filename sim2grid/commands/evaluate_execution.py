@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
 
+FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Planning, Missions, Resumable, Reported):
@@ -92,7 +95,7 @@ def run(args: Args) -> int:
 
     evaluation = _evaluation(args)
     if args.out:
-        held = Journal[Row](args.out, args.resume, _options(args), Row)
+        held = Journal[Row](args.out, args.resume, _options(args), Row, FILES)
         evaluation.rows |= {(row.contender, row.number): row for row in held.entries}
         evaluation.keep = held.add
     begun, interrupted = time.perf_counter(), False

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from sim2grid.study.evaluation import Row
     from sim2grid.study.sensitivity import Setting
 
+FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "curves.png", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Planning, Missions, Resumable, Reported):
@@ -119,7 +122,7 @@ class _Rows:
         self._journal: Journal[tuple[str, Row]] | None = None
         if args.out:
             self._journal = Journal(args.out, args.resume, command.figures(args),
-                                    tuple[str, Row])
+                                    tuple[str, Row], FILES)
             for key, row in self._journal.entries:
                 self._put(key, row)
 

@@ -13,8 +13,8 @@ import msgspec
 import numpy.typing as npt
 import tyro
 
-from moonteam import files, loading
-from moonteam.commands.options import Planning, Printed
+from moonteam import files, loading, outputs
+from moonteam.commands.options import Forced, Planning, Printed
 from moonteam.errors import InputError
 from moonteam.problem.mission import Mission
 from moonteam.report import command
@@ -30,9 +30,13 @@ if TYPE_CHECKING:
     from sim2grid.measure.metrics import GridPlan, Report
     from sim2grid.show.film import Film
 
+FILES = ("report.html", "video.mp4", "map.mp4", "paths.png", "report.json", "timing.json",
+         "config.json")
+"""In --out."""
+
 
 @dataclass(frozen=True)
-class Args(Planning, Printed):
+class Args(Planning, Forced, Printed):
     """Run a mission in physics: a video, a map of the paths and a report.
 
     The planner decides on the grid; every move becomes a waypoint that a simulated robot has to
@@ -45,7 +49,7 @@ class Args(Planning, Printed):
 
     Examples:
       moonteam rollout demo
-      moonteam rollout outpost --planner exact --backend native --out runs/outpost
+      moonteam rollout outpost --planner exact --backend native --out runs/exact
       moonteam rollout my_mission.yaml --planner exact --no-video --json
       moonteam rollout demo --planner exact --backend native --viewer
       moonteam rollout --from runs/execution/report.json --mission 17
@@ -73,7 +77,7 @@ class Args(Planning, Printed):
     contender: str | None = None
     """Whose run of it, a name in --from such as "closed exact barrier"; the first by default."""
     out: Aside[Path | None] = None
-    """Output folder; runs/NAME by default."""
+    """Output folder; runs/NAME by default, or runs/NAME-2 and so on where that holds a rollout."""
     video: Aside[bool] = True
     """Make the video."""
     viewer: Aside[bool] = False
@@ -146,9 +150,19 @@ def carry_out(args: Args) -> Done:
 
         check_display()
     made = _from_file(args) if args.report is None else _from_report(args)
-    mission = made.prepared.mission
-    out = args.out or Path("runs") / files.safe_name(mission.name, "mission")
-    _make_folder(out, args, made.prepared.written)
+    out = folder(made.prepared.mission.name, args.out, args.force)
+    with outputs.folder(out, FILES, force=args.force):
+        return _carry_out(args, made, out)
+
+
+def folder(mission: str, out: Path | None, force: bool) -> Path:
+    """The output folder of a mission's rollout."""
+    default = Path("runs") / files.safe_name(mission, "mission")
+    return out or (default if force else outputs.free(default, FILES))
+
+
+def _carry_out(args: Args, made: Run, out: Path) -> Done:
+    _begin_folder(out, args, made.prepared.written)
     interrupted = False
     try:
         timing = _drive(args, made)
@@ -172,8 +186,6 @@ def _check(args: Args) -> None:
 
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
-    if args.out is not None and args.out.exists() and not args.out.is_dir():
-        raise InputError("--out", f"{args.out} is a file; a folder is needed")
     parse(args.decode)
     if args.mode == "clock" and args.backend == "fused":
         raise InputError("--backend fused", "drives in steps; by the clock mjx or native")
@@ -268,15 +280,10 @@ def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> GridPlan:
     return GridPlan(trace.complete, trace.makespan, trace.moves)
 
 
-def _make_folder(out: Path, args: Args, mission: Mission) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("--out", f"{out} cannot be made: {error.strerror}") from None
-    for name in ("video.mp4", "map.mp4", "paths.png", "report.json", "timing.json",
-                 "report.html"):
-        (out / name).unlink(missing_ok=True)  # of an earlier run
-    options = {key: value for key, value in asdict(args).items() if key not in ("out", "json")}
+def _begin_folder(out: Path, args: Args, mission: Mission) -> None:
+    outputs.clear(out, FILES)
+    options = {key: value for key, value in asdict(args).items()
+               if key not in ("out", "json", "force")}
     files.write_json(out / "config.json", {
         "moonteam": __version__, "options": options, "mission": msgspec.to_builtins(mission)})
 

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from moonteam import files
 from moonteam.problem.mission import Mission
+from moonteam.report import video
 from moonteam.robots.base import Glyph
 from sim2grid.frame import Frame
 from sim2grid.loop.record import Record
@@ -290,15 +290,9 @@ class Film:
 def write(film: Film, path: str | os.PathLike[str],
           progress: Callable[[], None] = lambda: None) -> None:
     """Writes the film as h264, whole or not at all; `progress` is called after each frame."""
-    import imageio_ffmpeg
-    import mediapy
-
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    with (files.replacing(path) as temporary,
-          mediapy.VideoWriter(temporary, (HEIGHT, WIDTH), codec="h264", fps=FPS,
-                              crf=23) as writer):
+    with video.writing(path, (HEIGHT, WIDTH), FPS, crf=23) as add:
         for picture in film.frames():
-            writer.add_image(picture)
+            add(picture)
             progress()
 
 

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from moonteam import files
+from moonteam import files, outputs
 from moonteam.errors import InputError
 from moonteam.report.command import flag
 from moonteam.version import __version__
@@ -23,26 +23,27 @@ class Journal(Generic[Entry]):
     `entries` is what was done before; empty unless the run is resumed.
     """
 
-    def __init__(self, out: Path, resume: bool, options: dict[str, Any], kind: Any):
+    def __init__(self, out: Path, resume: bool, options: dict[str, Any], kind: Any,
+                 names: Sequence[str] = ()):
         """Starts the folder, or reads what is done if it is to be resumed.
 
-        `kind` is the type of an entry. Raises InputError.
+        `kind` is the type of an entry, `names` what an earlier run left, to be removed unless it is
+        resumed. Raises InputError.
         """
-        if out.exists() and not out.is_dir():
-            raise InputError("--out", f"{out} is a file; a folder is needed")
         self._path, config = out / "rows.jsonl", out / "config.json"
         self.entries: list[Entry] = []
         held = {"moonteam": __version__, "options": options}
         if resume:
             _check_same(out, config, msgspec.json.decode(files.dump_json(held)))
             self.entries = self._read(kind)
+        else:
+            outputs.clear(out, names)
         files.write_json(config, held)
         files.write_text(self._path, "".join(map(_line, self.entries)))
 
     def add(self, entry: Entry) -> None:
         """Adds an entry; what an interruption cuts off is dropped when the run is resumed."""
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(_line(entry))
+        files.append(self._path, _line(entry))
 
     def _read(self, kind: Any) -> list[Entry]:
         """The whole entries; half a line at the end is left out."""

@@ -10,13 +10,13 @@ import difflib
 import importlib
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from moonteam import files, loading
+from moonteam import files, loading, outputs
 from moonteam.errors import InputError
 from moonteam.loading import load
 from moonteam.problem.mission import Mission
@@ -33,6 +33,8 @@ if TYPE_CHECKING:  # JAX and MuJoCo, which take seconds, are loaded when they ar
 __all__ = ["evaluate", "load", "plan", "register", "rollout", "train"]
 
 Named = str | os.PathLike[str]
+WRITTEN = "mission.yaml"
+"""What a mission that is an object is written as, for its rollout."""
 T = TypeVar("T")
 
 
@@ -74,7 +76,9 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
       mission: a mission, its file, or the name of a bundled one.
       planner: who decides; a registered planner, or `FILE.py:OBJECT`. None: the policy, and by the
         clock the exact planner.
-      out: output folder; runs/NAME by default. A `Mission` is written there as mission.yaml.
+      out: output folder; runs/NAME by default, or runs/NAME-2 and so on where that holds a
+        rollout. A `Mission` is written there as mission.yaml. Nothing there is written over
+        without force=True.
       **options: of the command, such as backend="native", mode="async" or video=False.
 
     Returns the report that is written as report.json: SI units, `success`, `seconds`,
@@ -82,20 +86,27 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
     saved then).
     """
     command = _command("sim2grid", "rollout")
+    folder = None if out is None else Path(out)
+    args = _built(command.Args, "rollout", {"planner": planner, "out": folder, **options})
     if isinstance(mission, Mission):
-        import yaml
-
-        name = files.safe_name(mission.name, "mission")
-        folder = Path(out) if out is not None else Path("runs") / name
-        file = folder / "mission.yaml"
-        files.write_text(file, yaml.safe_dump(msgspec.to_builtins(mission), sort_keys=False))
+        folder = command.folder(mission.name, folder, args.force)
+        with outputs.folder(folder, (*command.FILES, WRITTEN), force=args.force):
+            done = command.carry_out(replace(args, out=folder,
+                                             mission=os.fspath(_write(folder, mission))))
     else:
-        file, folder = Path(mission), None if out is None else Path(out)
-    done = command.carry_out(_built(command.Args, "rollout", {
-        "mission": os.fspath(file), "planner": planner, "out": folder, **options}))
+        done = command.carry_out(replace(args, mission=os.fspath(mission)))
     if done.interrupted:
         raise KeyboardInterrupt
     return done.report
+
+
+def _write(folder: Path, mission: Mission) -> Path:
+    import yaml
+
+    outputs.clear(folder, (WRITTEN,))
+    files.write_text(folder / WRITTEN, yaml.safe_dump(msgspec.to_builtins(mission),
+                                                      sort_keys=False))
+    return folder / WRITTEN
 
 
 def evaluate(what: Named | Scenario | Timed | Sequence[Scenario] | Sequence[Timed],

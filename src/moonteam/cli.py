@@ -1,7 +1,8 @@
 """The `moonteam` command: a table of subcommands, each loaded only when it is asked for.
 
 A command module holds `Args`, a frozen dataclass whose docstring is the help text and
-whose fields tyro reads, and `run(args) -> int`, which returns the exit code.
+whose fields tyro reads, `run(args) -> int`, which returns the exit code, and, where it writes into
+a folder `--out`, `FILES`: their names, for which the folder is held while it runs.
 Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 interrupted, 141
 whoever read the output (`| head`) went away.
 """
@@ -117,7 +118,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR,
-              errno.EEXIST, errno.ENAMETOOLONG, errno.EFBIG)
+              errno.EEXIST, errno.ENAMETOOLONG, errno.EFBIG, errno.EISDIR, errno.ELOOP, errno.EIO)
 RENDERERS = ("egl", "osmesa", "glfw", "disable")
 """What MUJOCO_GL may be, for us; mujoco knows other words for the same."""
 
@@ -152,7 +153,11 @@ def _run(words: list[str]) -> int:
         return 0
     name, rest = find_command(words)
     module = importlib.import_module(COMMANDS[name][0])
-    return module.run(parse(name, rest))
+    args = parse(name, rest)
+    from moonteam.commands import options
+
+    with options.keeping(args, getattr(module, "FILES", ())):
+        return module.run(args)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,17 @@
-"""How JAX is set up in this process: its compilation cache, and the memory it works in."""
+"""How JAX and Numba are set up in this process: what they compiled is kept, where it can be."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from moonteam import files
+from moonteam.errors import InputError
 
 
 def cache_folder() -> Path:
@@ -14,8 +19,8 @@ def cache_folder() -> Path:
     chosen = os.environ.get("MOONTEAM_CACHE")
     if chosen:
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "moonteam"
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # ~ if homeless
+    return Path(base) / "moonteam"
 
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4  # of glibc's mallopt(3)
@@ -49,8 +54,8 @@ def keep_freed_memory() -> None:
 def enable_cache() -> None:
     """Turns the cache on for this process; call it before anything is jitted.
 
-    A folder that cannot be written leaves the cache off: it saves time, nothing else. Freed
-    memory is kept, see `keep_freed_memory`.
+    A folder that cannot be written leaves the cache off: it saves time, nothing else. Any number
+    of processes share it. Freed memory is kept, see `keep_freed_memory`.
     """
     import jax
 
@@ -62,9 +67,53 @@ def enable_cache() -> None:
         return
     if not os.access(folder, os.W_OK):
         return
+    _keep_whole_entries()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _keep_whole_entries() -> None:
+    """JAX's cache takes entries whole or not at all.
+
+    JAX writes them in place: another process may read half of one, and of a process that is
+    killed, or a disk that is full, half of one stays for good, complained about at every start.
+    """
+    from jax._src.lru_cache import LRUCache
+
+    put = getattr(LRUCache.put, "jaxs", LRUCache.put)
+
+    def put_whole(self: Any, key: str, value: bytes) -> None:
+        if self.eviction_enabled:  # it has locks then
+            return put(self, key, value)
+        path = Path(str(self.path)) / f"{key}-cache"
+        if not path.exists():
+            with contextlib.suppress(OSError, InputError), files.replacing(path) as temporary:
+                temporary.write_bytes(value)
+
+    put_whole.jaxs = put  # type: ignore[attr-defined]
+    LRUCache.put = put_whole
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Numba's decorator, without its cache where that has nowhere to be, or no room."""
+    import numba
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            made: Any = numba.njit(**options)(function)
+        except RuntimeError:
+            return numba.njit(**options | {"cache": False})(function)
+        save = made._cache.save_overload
+
+        def save_if_possible(signature: Any, data: Any) -> None:
+            with contextlib.suppress(OSError):
+                save(signature, data)
+
+        made._cache.save_overload = save_if_possible
+        return made
+
+    return decorate
 
 
 def devices() -> list[Any]:

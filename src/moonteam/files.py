@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from moonteam import outputs
 from moonteam.errors import InputError
 from moonteam.strict import json_value
 
@@ -97,9 +98,11 @@ def _struct_or_item(info: Any, part: str) -> Any:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside `path`, renamed onto it on success and removed on failure.
 
-    The suffix is kept, since writers such as ffmpeg choose their format by it.
+    The suffix is kept, since writers such as ffmpeg choose their format by it. Raises InputError
+    for what is in the way (see `moonteam.outputs`) and where the disk takes no more.
     """
     path = Path(path)
+    outputs.admit(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
     os.close(handle)
@@ -107,9 +110,31 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
+        outputs.publish(temporary, path)
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, name, temporary):
+            raise _unwritten(path, error) from None
+        raise
+
+
+def append(path: Path, text: str) -> None:
+    """Adds UTF-8 text to a file's end, whole or not at all. Raises InputError if it cannot be."""
+    outputs.admit(path)
+    with path.open("ab", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END)
+        data = text.encode()
+        try:
+            while data:  # a full disk may take a part of it
+                data = data[file.write(data):]
+        except OSError as error:
+            file.truncate(end)
+            raise _unwritten(path, error) from None
+
+
+def _unwritten(path: Path, error: OSError) -> InputError:
+    # NumPy and GDAL give no number, only words.
+    return InputError(path, f"cannot be written: {error.strerror or error}")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

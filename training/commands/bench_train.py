@@ -12,6 +12,9 @@ from moonteam.commands.options import Reported
 from moonteam.errors import InputError
 from training.bench.measure import Wanted
 
+FILES = ("bench_train.json", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Reported):

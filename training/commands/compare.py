@@ -8,10 +8,13 @@ from pathlib import Path
 import tyro
 
 from moonteam import files
-from moonteam.commands.options import Reported
+from moonteam.commands.options import Reported, keeping
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from training.run.compare import Kind, grouped, listed, notes, plain, read, shared, summary
+
+FILES = ("compare.json", "table.md", "curves.png")
+"""In --out."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,11 @@ def parse(words: list[str]) -> Args:
 
 def run(args: Args) -> int:
     """Reads, prints, saves; returns the exit code."""
+    with keeping(args, FILES):
+        return _compare(args)
+
+
+def _compare(args: Args) -> int:
     from moonteam.report import command, provenance, tables
     from training.mappo.compared import MAPPO
     from training.mappo.macro.compared import MACRO

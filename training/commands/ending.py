@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from moonteam import files
+from moonteam import files, outputs
 from moonteam.commands.options import Printed, RunFolder, Seeded
 from moonteam.report.command import Aside
-from training.run.machine import Diverged, Run, stop_on_signals
+from training.run.machine import FILES, Diverged, Run, stop_on_signals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +33,10 @@ class Watched(RunFolder, Printed):
 
             tensorboard_writer()
         return self.out or Path("runs") / f"{name}-{seed}"
+
+    def holding(self, out: Path) -> AbstractContextManager[None]:
+        """Holds the run folder for this process. Raises InputError if it holds another run."""
+        return outputs.folder(out, FILES, force=self.force, resume=self.resume)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,10 +62,12 @@ def run(args: Args) -> int:
     config = dataclasses.replace(preset, seed=args.seed, rounds=rounds, lr=lr, spec=spec)
     out = args.folder(f"imitate-{args.preset}", args.seed)
     use_all_cores()
-    say("moonteam: making grounds and held-out scenarios, compiling")
-    dagger = Dagger(config, params, args.preset, args.begin)
-    run = Run(dagger, out, args.resume, args.checkpoint_seconds, tensorboard=args.tensorboard)
-    return complete(run, args.json)
+    with args.holding(out):
+        say("moonteam: making grounds and held-out scenarios, compiling")
+        dagger = Dagger(config, params, args.preset, args.begin)
+        run = Run(dagger, out, args.resume, args.checkpoint_seconds,
+                  tensorboard=args.tensorboard, force=args.force)
+        return complete(run, args.json)
 
 
 def entity_policy(name: str) -> tuple[EntitySpec, Any]:

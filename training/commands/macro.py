@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from moonteam import paths
+from moonteam import outputs, paths
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.progress import say
@@ -56,15 +57,22 @@ def run(args: Args) -> int:
         return _train(args)
     if len(set(args.seeds)) < len(args.seeds):
         raise InputError("--seeds", f"{' '.join(map(str, args.seeds))}: a seed is given twice")
+    from training.commands import compare
+
     base = args.out or args.folder(args.config.macro, args.seeds[0]).parent / args.config.macro
+    with outputs.folder(base, compare.FILES, force=args.force, resume=args.resume):
+        return _train_all(args, base)
+
+
+def _train_all(args: Args, base: Path) -> int:
+    from training.commands import compare
+
     for seed in args.seeds:
         out = base / str(seed)
         one = dataclasses.replace(args, seeds=(), out=out, resume=args.resume and out.exists(),
                                   config=dataclasses.replace(args.config, seed=seed))
         if code := _train(one):
             return code
-    from training.commands import compare
-
     return compare.run(compare.Args(tuple(base / str(seed) for seed in args.seeds), out=base))
 
 
@@ -77,10 +85,11 @@ def _train(args: Args) -> int:
         spec, params = _pointer(args.policy)
         config = dataclasses.replace(config, spec=spec)
     out = args.folder(config.macro, config.seed)
-    say("moonteam: making grounds and held-out problems, compiling")
-    trainee = MacroMappo(config, params, args.policy)
-    return complete(Run(trainee, out, args.resume, args.checkpoint_seconds,
-                        tensorboard=args.tensorboard), args.json)
+    with args.holding(out):
+        say("moonteam: making grounds and held-out problems, compiling")
+        trainee = MacroMappo(config, params, args.policy)
+        return complete(Run(trainee, out, args.resume, args.checkpoint_seconds,
+                            tensorboard=args.tensorboard, force=args.force), args.json)
 
 
 def _pointer(name: str) -> tuple[Any, Any]:

@@ -75,13 +75,15 @@ def run(args: Args) -> int:
         rounds=args.rounds, lr=args.lr, leash=args.leash, ent_coef=args.ent_coef,
         seed=args.seed)
     out = args.folder("refine", args.seed)
-    say("moonteam: making grounds and held-out scenarios, compiling")
-    refiner = Refiner(config, params, source="" if args.policy == FRESH else args.policy)
-    run = Run(refiner, out, args.resume, args.checkpoint_seconds, tensorboard=args.tensorboard)
-    code = complete(run, args.json)
-    if others and code == 0:
-        draw_curve(out / "beside.png", {str(out): run.metrics.rows} | others)
-    return code
+    with args.holding(out):
+        say("moonteam: making grounds and held-out scenarios, compiling")
+        refiner = Refiner(config, params, source="" if args.policy == FRESH else args.policy)
+        run = Run(refiner, out, args.resume, args.checkpoint_seconds,
+                  tensorboard=args.tensorboard, force=args.force)
+        code = complete(run, args.json)
+        if others and code == 0:
+            draw_curve(out / "beside.png", {str(out): run.metrics.rows} | others)
+        return code
 
 
 def _fresh(seed: int) -> tuple[EntitySpec, Any]:

@@ -136,5 +136,7 @@ def _train(args: Args) -> int:
     if args.coordinator:
         sharding.join(args.coordinator, args.processes, args.process)
         out = out / f"process-{args.process}" if args.process else out
-    return complete(Run(Mappo(config), out, args.resume, args.checkpoint_seconds,
-                        args.stop_on_collapse, args.tensorboard, args.begin), args.json)
+    with args.holding(out):
+        return complete(Run(Mappo(config), out, args.resume, args.checkpoint_seconds,
+                            args.stop_on_collapse, args.tensorboard, args.begin, args.force),
+                        args.json)

@@ -22,7 +22,7 @@ import jax
 import msgspec
 import numpy as np
 
-from moonteam import files
+from moonteam import files, outputs
 from moonteam.errors import InputError
 from moonteam.policies.policy_file import save_policy
 from moonteam.report.progress import bar
@@ -32,6 +32,10 @@ from training.run.checkpoints import About
 from training.run.metrics import Metrics, best
 from training.run.trainee import Position, Row, Trainee
 from training.sharding import anywhere, describe_device, gather
+
+FILES = ("config.json", "metrics.jsonl", "checkpoints", "policy.safetensors", "report.json",
+         "curve.png", "beside.png", "events.out.tfevents.*")
+"""Of a run folder."""
 
 
 class Diverged(Exception):
@@ -75,8 +79,9 @@ class Run:
 
     def __init__(self, trainee: Trainee, out: Path, resume: bool,
                  checkpoint_seconds: float = 30.0, stop_on_collapse: bool = True,
-                 tensorboard: bool = False, begin: Path | None = None):
-        """`begin`: a checkpoint of another run, to go on from with this one's numbers.
+                 tensorboard: bool = False, begin: Path | None = None, force: bool = False):
+        """`begin`: a checkpoint of another run, to go on from with this one's numbers. `force`: an
+        earlier run in the folder is removed.
 
         Raises InputError if the folder holds a run that this one may not go on with, or `begin`
         is no checkpoint that it could begin with.
@@ -86,7 +91,12 @@ class Run:
         # Of the code that is loaded now, whatever is checked out later.
         self.commit = commit() or "unknown"
         self.folder = out / "checkpoints"
-        self.position = self._find(resume) if begin is None else self._begun(begin, resume)
+        if force and begin is not None and begin.resolve().is_relative_to(out.resolve()):
+            raise InputError("--begin", f"{begin} is in the folder that --force would empty")
+        self.position = self._find(resume, force) if begin is None else self._begun(
+            begin, resume, force)
+        if force:
+            outputs.clear(out, FILES)
         self.metrics = Metrics(out / "metrics.jsonl", self.position.total_updates, tensorboard,
                                begin and begin.parent.parent / "metrics.jsonl")
         self.last_saved, self.saved = time.monotonic(), self.position.total_updates
@@ -95,26 +105,28 @@ class Run:
             self.save()
         files.write_json(out / "config.json", trainee.recipe)
 
-    def _find(self, resume: bool) -> Position:
-        self._check_folder(resume)
-        found = checkpoints.load(self.folder)
+    def _find(self, resume: bool, force: bool) -> Position:
+        self._check_folder(resume, force)
+        found = None if force else checkpoints.load(self.folder)
         if found is None:
             return Position(self.trainee.phases[0][0])
         return self._restored(*found, self.folder)
 
-    def _begun(self, begin: Path, resume: bool) -> Position:
+    def _begun(self, begin: Path, resume: bool, force: bool) -> Position:
         if resume:
             raise InputError("--begin", "is for a new run; --resume alone goes on with one")
-        self._check_folder(resume)
+        self._check_folder(resume, force)
         return self._restored(*checkpoints.read(begin), begin)
 
-    def _check_folder(self, resume: bool) -> None:
+    def _check_folder(self, resume: bool, force: bool) -> None:
         """Raises InputError if the folder holds a run, and not one to be resumed as it is."""
+        if force:
+            return
         stored, earlier = self.out / "config.json", self.folder / "state.npz"
         held = stored.exists() or earlier.exists() or checkpoints.newest(self.folder) is not None
         if held and not resume:
-            raise InputError(self.out, "already holds a run; --resume goes on with it, or choose "
-                             "another --out")
+            raise InputError(self.out, "already holds a run; --resume goes on with it, --force "
+                             "replaces it, or choose another --out")
         if earlier.exists():
             raise InputError(earlier, "is a checkpoint of an earlier version, which can no longer "
                              "be gone on with; choose another --out")

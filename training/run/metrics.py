@@ -38,8 +38,7 @@ class Metrics:
     def add(self, row: Row) -> None:
         """One more line, on disk at once."""
         self.rows.append(row)
-        with self.path.open("a", encoding="utf-8") as out:
-            out.write(files.dump_json(row) + "\n")
+        files.append(self.path, files.dump_json(row) + "\n")
         if self.events:
             for name, value in scalars(row).items():
                 self.events.add_scalar(name, value, row["env_steps"])

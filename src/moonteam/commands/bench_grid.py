@@ -8,6 +8,9 @@ from moonteam import compilation
 from moonteam.commands.options import Many, Reported, Seeded
 from moonteam.errors import InputError
 
+FILES = ("bench.json", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Seeded, Reported):

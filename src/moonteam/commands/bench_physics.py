@@ -14,6 +14,9 @@ from moonteam.errors import InputError
 if TYPE_CHECKING:
     from moonteam.physics.scene import Scene
 
+FILES = ("bench_physics.json", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Reported):

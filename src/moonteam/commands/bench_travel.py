@@ -9,6 +9,9 @@ from moonteam import compilation
 from moonteam.commands.options import Reported, Seeded
 from moonteam.errors import InputError
 
+FILES = ("bench_travel.json", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Seeded, Reported):

@@ -16,6 +16,9 @@ from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
 
+FILES = ("report.json", "summary.csv", "rows.csv", "table.md", "gaps.png")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Drawn, Limited, Reported):

@@ -13,6 +13,9 @@ from moonteam.commands.options import Limited, Many, Reported, Seeded
 from moonteam.errors import InputError
 from moonteam.problem.timed import Timed
 
+FILES = ("peers.json", "table.md", "rows.csv")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Seeded, Limited, Reported):

@@ -12,6 +12,9 @@ from moonteam.commands.evaluate_grid import load_set
 from moonteam.commands.options import Limited, Reported, Seeded
 from moonteam.errors import InputError
 
+FILES = ("report.json", "table.md", "preference.png")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Seeded, Limited, Reported):

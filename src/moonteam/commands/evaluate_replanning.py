@@ -13,6 +13,9 @@ from moonteam.commands.options import Drawn, Limited, Many, Reported
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 
+FILES = ("report.json", "summary.csv", "rows.csv", "table.md", "replanning.png")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Drawn, Limited, Reported):

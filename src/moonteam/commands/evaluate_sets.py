@@ -22,6 +22,9 @@ POLICY = "policy"
 Who = tuple[str, Path | None]
 """A planner, and the policy file where it is the policy."""
 
+FILES = ("report.json", "summary.csv", "rows.csv", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Seeded, Limited, Reported):

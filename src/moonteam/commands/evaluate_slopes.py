@@ -11,6 +11,9 @@ from moonteam.errors import InputError
 if TYPE_CHECKING:
     from moonteam.robots import RobotKind
 
+FILES = ("slopes.json", "table.md")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Reported):

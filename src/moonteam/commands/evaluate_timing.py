@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from moonteam import compilation, files, paths
 from moonteam.commands.options import Many, Reported, Seeded
 
+FILES = ("report.json", "timing.csv", "table.md", "timing.png")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Seeded, Reported):

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 EXTENT = 26.0
 """Side of the sites beyond the length of a traverse, m."""
 
+FILES = ("traverse.json", "traverse.csv", "table.md", "sheet.png",
+         "*-rim.mp4", "*-boulders.mp4", "*-slope.mp4")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Reported):
@@ -31,7 +35,7 @@ class Args(Reported):
     (slope over its footprint, boulders) are drawn again, and the number of draws is reported.
     Means are over traverses that arrived, intervals are 95 %.
 
-    Files in --out: traverse.json, traverse.csv and table.md.
+    Files in --out: traverse.json, traverse.csv and table.md; with --video sheet.png and the films.
 
     Examples:
       moonteam evaluate traverse --kind my_rover.py:ROVER --site mare

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from moonteam import compilation, files, paths
-from moonteam.commands.options import Printed, Seeded
+from moonteam import compilation, files, outputs, paths
+from moonteam.commands.options import Forced, Printed, Seeded
 from moonteam.errors import InputError
 from moonteam.report.command import Aside
 
@@ -20,7 +20,7 @@ TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Args(Seeded, Printed):
+class Args(Seeded, Forced, Printed):
     """Write a policy as a self-contained ONNX file and hold it against the original.
 
     The file takes any number of robots and targets where the policy does; its metadata say
@@ -71,6 +71,11 @@ def run(args: Args) -> int:
     out = args.out or Path(f"{path.stem}.onnx")
     if out.suffix != ".onnx":
         raise InputError("--out", f"{out} does not end in .onnx")
+    with outputs.file(out, args.force):
+        return _export(args, path, out)
+
+
+def _export(args: Args, path: Path, out: Path) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import exported
     from moonteam.policies.policy import Policy

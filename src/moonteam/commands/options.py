@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import tyro
 
+from moonteam import outputs
 from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
@@ -38,6 +40,14 @@ def parse(kind: type[T], name: str, words: Sequence[str], default: T | None = No
                     config=(tyro.conf.FlagCreatePairsOff,))
 
 
+def keeping(args: Any, names: Sequence[str]) -> AbstractContextManager[None]:
+    """Holds the folder of `--out` for the files `names`, if there are any and it is given."""
+    if not names or args.out is None:
+        return nullcontext()
+    return outputs.folder(args.out, names, force=args.force,
+                          resume=getattr(args, "resume", None))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Printed:
     """How a result is printed."""
@@ -47,7 +57,15 @@ class Printed:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Saved:
+class Forced:
+    """What is done about files that are there already."""
+
+    force: Aside[bool] = False
+    """Replace files that are there already; without it nothing is written over."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Saved(Forced):
     """Where a result is written to."""
 
     out: Aside[Path | None] = None
@@ -79,7 +97,7 @@ class Resumable:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFolder(Resumable):
+class RunFolder(Resumable, Forced):
     """Where a training run lives."""
 
     out: Aside[Path | None] = None

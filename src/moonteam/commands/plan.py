@@ -17,6 +17,9 @@ from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
 from moonteam.report.progress import busy
 
+FILES = ("plan.json", "plan.png")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Planning, Saved, Printed):
@@ -37,7 +40,7 @@ class Args(Planning, Saved, Printed):
       moonteam plan assets/testsets/8x40.jsonl:3 --planner lns --time-limit 10
       moonteam plan outpost --objective weighted --alpha 1 --beta 0.05 --json
       moonteam plan outpost --planner policy --decode best-of-16
-      moonteam plan outpost --clock seconds --out runs/plan
+      moonteam plan outpost --clock seconds --out runs/clock
     """
 
     scenario: tyro.conf.Positional[str]

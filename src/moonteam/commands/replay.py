@@ -17,6 +17,9 @@ from moonteam.problem import scenario
 from moonteam.problem.scenario import ACTIONS, Scenario
 from moonteam.strict import json_value
 
+FILES = ("replay.json",)
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Saved, Printed):

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
     Maps = dict[str, npt.NDArray[Any]]
 
+FILES = ("site.json", "heights.npy", "heights.tif", "maps.npz", "hillshade.png", "slope.png",
+         "roughness.png", "traversability.png", "travel.png")
+"""In --out."""
+
 
 @dataclass(frozen=True)
 class Args(Saved, Printed):
@@ -31,7 +35,7 @@ class Args(Saved, Printed):
       moonteam site --preset mare --seed 3 --size 32 --out runs/site
       moonteam site --dem moon.tif --size 40 --centre 120 -35 --detrend --out runs/dem
       moonteam site --dem heights.npy --pixel 1.0 --json
-      moonteam site --preset highland --travel KIND --to 5 -3 --out runs/site
+      moonteam site --preset highland --travel KIND --to 5 -3 --out runs/travel
     """
 
     preset: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"

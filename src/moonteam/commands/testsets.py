@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from moonteam import files
+from moonteam import files, outputs
 from moonteam.commands import testsets_seconds
-from moonteam.commands.options import Printed
+from moonteam.commands.options import Forced, Printed
 from moonteam.errors import InputError
 from moonteam.problem import timed
 from moonteam.problem.scenario import Optimal, Scenario, save_set
@@ -56,10 +55,11 @@ RECIPES = (
 )
 NAMES = tuple(recipe.name() for recipe in RECIPES)
 ALL = NAMES + testsets_seconds.NAMES
+INDEX = "index.json"
 
 
 @dataclass(frozen=True)
-class Args(Printed):
+class Args(Forced, Printed):
     """Makes the test sets, one .jsonl file each, with index.json that tells how.
 
     Every scenario can be solved within its 128 steps; draws that cannot are drawn again.
@@ -169,8 +169,18 @@ def run(args: Args) -> int:
             raise InputError(option, f"{value} is not allowed; at least 1")
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
-    index_path = args.out / "index.json"
-    index = json.loads(files.read_text(index_path)) if index_path.exists() else {}
+    with outputs.folder(args.out, [f"{name}.jsonl" for name in args.sets], force=args.force,
+                        updates=(INDEX,), together=False):
+        index = _make_all(args)
+    if args.json:
+        print(files.dump_json(index))
+    return 0
+
+
+def _make_all(args: Args) -> dict[str, Any]:
+    """Makes the sets; the index of the folder, with those that were there before."""
+    index_path = args.out / INDEX
+    index = files.read_json(index_path, dict[str, Any]) if index_path.exists() else {}
     for recipe in (*RECIPES, *testsets_seconds.RECIPES):
         name = recipe.name()
         if name not in args.sets:
@@ -180,9 +190,7 @@ def run(args: Args) -> int:
         files.write_json(index_path, dict(sorted(index.items())))
         if not args.json:
             print(summary(name, index[name]), flush=True)
-    if args.json:
-        print(files.dump_json(index))
-    return 0
+    return index
 
 
 def make_one(recipe: Recipe | testsets_seconds.Recipe, args: Args,

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import tyro
 
-from moonteam import files
-from moonteam.commands.options import Limited, Printed
+from moonteam import files, outputs
+from moonteam.commands.options import Forced, Limited, Printed
 from moonteam.errors import InputError
 from moonteam.problem import timed
 from moonteam.problem.timed import Timed
 
 
 @dataclass(frozen=True)
-class Args(Limited, Printed):
+class Args(Limited, Forced, Printed):
     """Reads a folder of others' instances and writes a set that `evaluate` takes.
 
     Each problem keeps its own name as id, says where it comes from in `source`, and holds in
@@ -47,10 +47,11 @@ def run(args: Args) -> int:
         raise InputError("--out", f"{args.out} is not allowed; a set ends in .jsonl")
     if args.limit is not None and args.limit < 1:
         raise InputError("--limit", f"{args.limit} is not allowed; at least 1")
-    found = importer.read(args.folder)[:args.limit]
-    if not found:
-        raise InputError(args.folder, f"holds no instance of {importer.name}")
-    timed.save_set(args.out, found)
+    with outputs.file(args.out, args.force):
+        found = importer.read(args.folder)[:args.limit]
+        if not found:
+            raise InputError(args.folder, f"holds no instance of {importer.name}")
+        timed.save_set(args.out, found)
     said = describe(found)
     if args.json:
         print(files.dump_json({"set": str(args.out), **said}))

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from moonteam.compilation import cores
+from moonteam.compilation import cores, njit
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.exact import MAX_TARGETS

@@ -140,7 +140,10 @@ def roughness_exponent(heights: np.ndarray, spacing: float) -> tuple[float, floa
 
 def write_dem(path: str | os.PathLike[str], heights: np.ndarray, spacing: float) -> None:
     """Writes elevations [ny, nx] m as a float32 GeoTIFF with the site's centre at (0, 0)."""
-    tg.write_geotiff(path, _raster(heights, spacing))
+    try:
+        tg.write_geotiff(path, _raster(heights, spacing))
+    except tg.GeoTiffError as error:  # the disk's
+        raise OSError(str(error).rpartition(": ")[2]) from None
 
 
 def spectrum(heights: np.ndarray, pixel: float) -> tuple[float, float] | None:

@@ -24,6 +24,7 @@ from moonteam.physics import render
 from moonteam.physics.look import SUN_AZIMUTH
 from moonteam.physics.scene import Scene
 from moonteam.physics.trials.traverse import SAMPLE_SECONDS, Recording, Route
+from moonteam.report import video
 from moonteam.terrain.site import Site
 
 EVENTS = ("rim", "boulders", "slope")
@@ -101,11 +102,7 @@ def film(recording: Recording, path: Path, *, event: str = "", along: float | No
     A yellow line marks the way, a white tick every metre of it, a green post of 1.2 m the goal.
     Returns FRAMES of its pictures. Raises RenderingUnavailable without off-screen OpenGL.
     """
-    import imageio_ffmpeg
-    import mediapy
-
     scene, route, poses = recording
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     first, last = _clip(recording, along)
     shown = poses[first:last:EVERY]
     distance, views = scene.robots[0].kind.camera.distance, VIEWS
@@ -116,14 +113,13 @@ def film(recording: Recording, path: Path, *, event: str = "", along: float | No
     kept = set(np.linspace(0, len(shown) - 1, FRAMES).round().astype(int).tolist())
     stills = []
     drawing = render.Renderer(scene, width, height, shadows=True, shadow_reach=SHADOW_REACH)
-    with (drawing as renderer, replacing(path) as temporary,
-          mediapy.VideoWriter(temporary, (height, width), fps=1.0 / FRAME_SECONDS,
-                              crf=26) as writer):
+    with (drawing as renderer,
+          video.writing(path, (height, width), 1.0 / FRAME_SECONDS, crf=26) as add):
         for index, (pose, camera) in enumerate(zip(shown, cameras, strict=True)):
             seconds = first * SAMPLE_SECONDS + index * FRAME_SECONDS
             words = _words(scene, event, seconds, pose, speeds[index], rises[index])
             picture = renderer.frame(pose, camera, markers, words)
-            writer.add_image(picture)
+            add(picture)
             if index in kept:
                 stills.append(picture.copy())
     return stills

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.search import schedules
 from moonteam.planners.search.insertion import coalitions
 from moonteam.planners.search.task import Task

@@ -14,8 +14,8 @@ matter of a few additions.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.search.travel import UNREACHABLE
 
 MOST_COALITIONS = 512

@@ -31,8 +31,8 @@ when two processes share it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.search.travel import UNREACHABLE
 
 OPTIMAL, FEASIBLE, NONE = 0, 1, 2

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.base import BoolArray, IntArray, Snapshot
 from moonteam.problem.rules import DISPLACEMENTS, STAY, UNREACHABLE
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.seconds.base import NEVER, Int64, Moment, TimedPlan, makespan
 from moonteam.planners.seconds.search.decode import choose
 from moonteam.planners.seconds.search.goal import answer, infeasible, lists, schedule

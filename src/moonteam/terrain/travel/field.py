@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.terrain.travel.lines import at, line_seconds
 
 REACH = 8.0

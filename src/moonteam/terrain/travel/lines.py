@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from moonteam.compilation import njit
 
 TOUCH = 1e-9
 """Share of a line; shorter pieces in a square only touch it."""

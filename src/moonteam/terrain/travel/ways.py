@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.terrain.travel.field import DIAGONAL, REACH, leave
 from moonteam.terrain.travel.lines import at, line_seconds
 

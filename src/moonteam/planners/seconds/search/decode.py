@@ -12,7 +12,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from moonteam.compilation import njit
 
 LOOP: Any = {"cache": True, "nogil": True, "_nrt": False}
 """Options of inner loops: they make no arrays, and count no references to those they get."""

@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.seconds.base import NEVER
 from moonteam.planners.seconds.search.decode import enough
 

@@ -10,8 +10,8 @@ Legend: N agents, M open targets.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from moonteam.compilation import njit
 from moonteam.planners.search import schedules
 from moonteam.planners.search.travel import UNREACHABLE
 from moonteam.planners.seconds.search.labels import shortcut
