@@ -20,7 +20,7 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.kind import PlannerKind, PlannerOptions
-from moonteam.planners.lns import Weights, best_insertion, improve, measure
+from moonteam.planners.lns import Events, Weights, best_insertion, improve, measure
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search.insertion import coalitions
 from moonteam.planners.search.task import Task, weights
@@ -30,6 +30,8 @@ Arc = tuple[int, int, int]
 """(agent, from, to); place -1 is the agent's start."""
 
 _SCALE = 1000  # CP-SAT counts in integers: weights are rounded to thousandths
+_LOCAL = 0.3  # share of the time for the plan that it starts from
+_MAKING = 0.5  # share of what is left that making the model may take
 
 
 def _cp_model() -> Any:
@@ -56,12 +58,24 @@ class CpSatPlanner(RoutePlanner):
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
                  time_limit: float | None = 10.0, workers: int = 1):
         super().__init__(objective, alpha, beta)
-        self.time_limit = 10.0 if time_limit is None else time_limit
+        self.time_limit = self.limit = 10.0 if time_limit is None else time_limit
         self.workers = workers
         self._cp = _cp_model()
 
+    @classmethod
+    def _trial(cls) -> CpSatPlanner:
+        return cls()
+
     def _answer(self, task: Task, began: float) -> Answer:
-        model, arcs, span = self._model(task)
+        until = began + self.limit
+        goal = Weights.of(self.objective, self.alpha, self.beta, task)
+        known = improve(task, goal, best_insertion(task, goal), 0, 500,
+                        began + _LOCAL * self.limit)
+        built = self._model(task, until)
+        if built is None:
+            known = improve(task, goal, known, 0, None, until)
+            return Answer(_within(task, known), 0.0, False)
+        model, arcs, span = built
         moves = sum(way * arc for way, arc in arcs.values())
         alpha, beta = weights(self.objective, self.alpha, self.beta, len(task.start),
                               task.horizon)
@@ -71,10 +85,9 @@ class CpSatPlanner(RoutePlanner):
             raise InputError("--planner cpsat", f"alpha {alpha} and beta {beta} are too small; "
                              f"they are rounded to {1 / _SCALE}")
         model.minimize(whole[0] * span + whole[1] * moves)
-        hint = self._hint(model, task, arcs, began + 0.3 * self.time_limit)
+        _hint(model, task, arcs, known)
         solver = self._cp.CpSolver()
-        spent = time.perf_counter() - began
-        solver.parameters.max_time_in_seconds = max(0.01, self.time_limit - spent)
+        solver.parameters.max_time_in_seconds = max(0.01, until - time.perf_counter())
         solver.parameters.num_workers = self.workers
         status = solver.solve(model)
         scale = _SCALE if self.objective == "weighted" else 1
@@ -84,7 +97,7 @@ class CpSatPlanner(RoutePlanner):
         if status == self._cp.INFEASIBLE:
             return Answer(None, math.inf, True)
         if status not in (self._cp.OPTIMAL, self._cp.FEASIBLE):
-            return Answer(hint, bound, False)
+            return Answer(_within(task, known), bound, False)
         routes = np.full(task.start.shape, -1, np.int32)
         for a in range(len(task.start)):
             onward = {i: j for (b, i, j), (_, arc) in arcs.items()
@@ -95,10 +108,12 @@ class CpSatPlanner(RoutePlanner):
                 at, place = onward[at], place + 1
         return Answer(routes, bound, status == self._cp.OPTIMAL)
 
-    def _model(self, task: Task) -> tuple[Any, dict[Arc, tuple[int, Any]], Any]:
+    def _model(self, task: Task, until: float
+               ) -> tuple[Any, dict[Arc, tuple[int, Any]], Any] | None:
         """The model, its arcs with their steps and literals, and the makespan.
 
-        The arc from a place to itself means "not visited".
+        The arc from a place to itself means "not visited". None where the first agent's part shows
+        that there is no time to make it and to search.
         """
         model = self._cp.CpModel()
         agents, count = task.start.shape
@@ -118,12 +133,15 @@ class CpSatPlanner(RoutePlanner):
                 model.add(sum(p for p, team in zip(picked, teams, strict=True) if team >> a & 1)
                           == visits[a][t])
         for a in range(agents):
-            self._circuit(model, task, a, visits[a], times, arcs)
+            clock = time.perf_counter()
+            self._circuit(model, task, a, visits[a], times, arcs, until)
+            if (agents - a) * (time.perf_counter() - clock) > _MAKING * (until - clock):
+                return None
         return model, arcs, span
 
     def _circuit(self, model: Any, task: Task, agent: int, visits: list, times: list,
-                 arcs: dict[Arc, tuple[int, Any]]) -> None:
-        """One agent's circuit: start, its targets, and back at no cost."""
+                 arcs: dict[Arc, tuple[int, Any]], until: float) -> None:
+        """One agent's circuit: start, its targets, back at no cost. Left off where time is up."""
         count = len(times)
         between = task.between[task.kinds[agent]]
         mine = {}
@@ -142,26 +160,27 @@ class CpSatPlanner(RoutePlanner):
                 if i == j and i >= 0:
                     model.add(literal == 1 - visits[i])
                 mine[agent, i, j] = (way, literal)
+            if time.perf_counter() > until:
+                break
         model.add_circuit([(i + 1, j + 1, lit) for (_, i, j), (_, lit) in mine.items()])
         arcs.update(mine)
 
-    def _hint(self, model: Any, task: Task, arcs: dict[Arc, tuple[int, Any]],
-              until: float) -> IntArray | None:
-        """Starts the solver from a plan of the large-neighbourhood search; returns its routes.
 
-        None where it takes longer than the steps left.
-        """
-        goal = Weights.of(self.objective, self.alpha, self.beta, task)
-        events = improve(task, goal, best_insertion(task, goal), 0, 500, until)
-        routes: IntArray = events.routes(len(task.start))
-        used = set()
-        for a, route in enumerate(routes.tolist()):
-            places = [-1, *[t for t in route if t >= 0], -1]
-            used |= {(a, i, j) for i, j in itertools.pairwise(places)}
-            used |= {(a, t, t) for t in range(len(task.targets)) if t not in places}
-        for key, (_, literal) in arcs.items():
-            model.add_hint(literal, key in used)
-        return routes if measure(task, events)[0] <= task.horizon else None
+def _within(task: Task, events: Events) -> IntArray | None:
+    """A list's routes; None where it takes longer than the steps left."""
+    late = measure(task, events)[0] > task.horizon
+    return None if late else events.routes(len(task.start))
+
+
+def _hint(model: Any, task: Task, arcs: dict[Arc, tuple[int, Any]], events: Events) -> None:
+    """Starts the solver from a plan of the large-neighbourhood search."""
+    used = set()
+    for a, route in enumerate(events.routes(len(task.start)).tolist()):
+        places = [-1, *[t for t in route if t >= 0], -1]
+        used |= {(a, i, j) for i, j in itertools.pairwise(places)}
+        used |= {(a, t, t) for t in range(len(task.targets)) if t not in places}
+    for key, (_, literal) in arcs.items():
+        model.add_hint(literal, key in used)
 
 
 def _planner(options: PlannerOptions) -> CpSatPlanner:

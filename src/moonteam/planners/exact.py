@@ -54,6 +54,10 @@ class ExactPlanner(RoutePlanner):
         super().__init__(objective, alpha, beta)
         self.time_limit = time_limit
 
+    @classmethod
+    def _trial(cls) -> ExactPlanner:
+        return cls(time_limit=60.0)
+
     def _answer(self, task: Task, began: float) -> Answer:
         if len(task.targets) > MAX_TARGETS:
             raise InputError("--planner exact", f"{len(task.targets)} targets are open; the exact "

@@ -25,7 +25,8 @@ MAX_AGENTS = 30
 
 _HOT, _COLD = 2.0, 0.1  # temperatures in units of one step (or move)
 _STEER = 0.05  # weight of moves while searching for makespan: it breaks ties on plateaus
-_BLOCK = 250  # iterations between looks at the clock
+_BLOCK = 250  # iterations between looks at the clock, at most
+_FIRST, _SLICE = 5, 0.02  # the first so many; s that they then may take
 
 
 @dataclass
@@ -117,7 +118,7 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
     """
     masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
     now, best = events.copy(), events.copy()
-    began, done = time.perf_counter(), 0
+    began, done, room = time.perf_counter(), 0, _BLOCK if until is None else _FIRST
     cooling = math.log(_COLD / _HOT)
     while len(task.targets) > 1 and iterations != 0:
         clock = time.perf_counter()
@@ -127,13 +128,16 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
         share = max(shares)
         if share >= 1.0:
             break
-        block = _BLOCK if iterations is None else min(_BLOCK, iterations - done)
+        block = room if iterations is None else min(room, iterations - done)
         hot = goal.unit * _HOT * math.exp(cooling * share)
         insertion.improve(
             task.start, task.between, task.kinds, masks, first, now.order, now.team,
             goal.alpha, goal.beta, goal.true_alpha, goal.true_beta, task.horizon, block,
             hot, hot, seed + done, best.order, best.team)
         done += block
+        if iterations is None:
+            share = _SLICE / max(time.perf_counter() - clock, 1e-6)
+            room = int(min(_BLOCK, max(1, block * min(4.0, share))))
     return best
 
 
@@ -180,6 +184,10 @@ class LnsPlanner(InsertionPlanner):
         super().__init__(objective, alpha, beta)
         self.iterations = 2000 if iterations is None and time_limit is None else iterations
         self.time_limit, self.seed = time_limit, seed
+
+    @classmethod
+    def _trial(cls) -> LnsPlanner:
+        return cls(iterations=1, time_limit=60.0)
 
     def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
         """Starts a mission; the seed is that of the search."""

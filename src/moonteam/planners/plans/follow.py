@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -13,6 +14,12 @@ from moonteam.planners.base import IntArray, Objective, Plan, Snapshot
 from moonteam.planners.plans.routes import Certificate, infeasible, obstacles, plan_of_routes
 from moonteam.planners.search.task import Task, weights
 from moonteam.planners.search.travel import travel_times
+from moonteam.problem.scenario import Agent, Scenario, Target
+
+TRIAL = Scenario(
+    (2, 2), (Agent((0, 0), ("A",)), Agent((1, 0), ("B",))),
+    (Target((1, 1), ("A", "B"), "AND"), Target((1, 0), ("A",), "OR")), blocked={"*": ((0, 1),)})
+"""A mission that takes no time, for what is loaded or compiled at the first call."""
 
 
 def same_moment(one: Snapshot, other: Snapshot) -> bool:
@@ -85,6 +92,8 @@ class RoutePlanner(Follower):
     name: str
     most_targets: int | None = None
     """Open targets that it takes on; None: any number."""
+    time_limit: float | None = None
+    """Seconds a plan, in which compiling at the first is not counted; None: no limit."""
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05):
         weights(objective, alpha, beta, 1, 1)
@@ -96,8 +105,18 @@ class RoutePlanner(Follower):
     def _answer(self, task: Task, began: float) -> Answer:
         """Routes for a task that skills and ways allow; `began` is a `time.perf_counter()`."""
 
+    @classmethod
+    def _trial(cls) -> RoutePlanner | None:
+        """One of its kind that is done with `TRIAL` at once; None where nothing is compiled."""
+        return None
+
     def plan(self, snapshot: Snapshot) -> Plan:
         """A whole plan from this moment. Raises InputError if the planner cannot serve it."""
+        if self.time_limit is not None:
+            _compile(type(self))
+        return self._plan(snapshot)
+
+    def _plan(self, snapshot: Snapshot) -> Plan:
         began = time.perf_counter()
         agents = len(snapshot.cells)
         travel = travel_times(snapshot)
@@ -130,3 +149,11 @@ class RoutePlanner(Follower):
         solved[hopeless] = True
         longer = max(snapshot.max_steps, snapshot.step + 1) * 64
         return self.plan(replace(snapshot, solved=solved, max_steps=longer))
+
+
+@functools.cache
+def _compile(kind: type[RoutePlanner]) -> None:
+    """Has one of that kind plan, once a process: its first call compiles or loads what it needs."""
+    trial = kind._trial()
+    if trial is not None:
+        trial._plan(Snapshot.start(TRIAL))

@@ -28,46 +28,71 @@ def coalitions(start, skills, need, both):
     n, m = start.shape
     masks = np.empty(m * MOST_COALITIONS, np.int32)
     first = np.zeros(m + 1, np.int32)
+    able, team = np.empty(n, np.int32), np.empty(n, np.int32)
     count = 0
     for t in range(m):
-        able = 0
+        number = 0
         for a in range(n):
             if skills[a] & need[t] and start[a, t] < UNREACHABLE:
-                able |= 1 << a
+                able[number] = a
+                number += 1
         if not both[t]:
-            for a in range(n):
-                if able >> a & 1:
-                    masks[count] = 1 << a
-                    count += 1
+            for i in range(number):
+                masks[count] = 1 << able[i]
+                count += 1
         else:
-            team = able
-            while team:
-                if count - first[t] < MOST_COALITIONS and _minimal(team, skills, need[t]):
-                    masks[count] = team
-                    count += 1
-                team = (team - 1) & able
+            count = _teams(skills, need[t], able[:number], team, masks, count)
         first[t + 1] = count
     return masks[:count].copy(), first
 
 
 @njit(cache=True, nogil=True)
-def _minimal(team, skills, need):
-    """Whether the team has all of `need` and nobody is to spare."""
-    have = 0
-    for a in range(skills.shape[0]):
-        if team >> a & 1:
-            have |= skills[a]
-    if have & need != need:
-        return False
-    for a in range(skills.shape[0]):
-        if team >> a & 1:
-            others = 0
-            for b in range(skills.shape[0]):
-                if b != a and team >> b & 1:
-                    others |= skills[b]
-            if others & need == need:
-                return False
-    return True
+def _teams(skills, need, able, team, masks, count):
+    """Adds the minimal coalitions of `able` for one target, largest mask first; the new count.
+
+    Agents are taken in or left out one by one, from the last; nobody joins who would make a member
+    one to spare, for such a team only has larger ones like it. All subsets were 2^N.
+    """
+    most, whole = count + MOST_COALITIONS, 0
+    for a in able:
+        whole |= skills[a]
+    if whole & need != need:
+        return count
+    size, i = 0, len(able) - 1
+    while count < most:
+        if i < 0:  # back to the last who was taken in, and leave that one out
+            if size == 0:
+                break
+            size -= 1
+            i = team[size] - 1
+            continue
+        team[size] = i
+        if _tight(skills, need, able, team, size + 1):
+            have, mask = 0, 0
+            for k in range(size + 1):
+                have |= skills[able[team[k]]]
+                mask |= 1 << able[team[k]]
+            if have & need == need:
+                masks[count] = mask
+                count += 1
+            else:
+                size += 1
+        i -= 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _tight(skills, need, able, team, size):
+    """Whether every member brings something needed that no other brings."""
+    once, twice = 0, 0
+    for k in range(size):
+        brought = skills[able[team[k]]] & need
+        twice |= once & brought
+        once |= brought
+    spare = False
+    for k in range(size):
+        spare |= skills[able[team[k]]] & need & ~twice == 0
+    return not spare
 
 
 @njit(cache=True, nogil=True)

@@ -16,7 +16,7 @@ from typing import Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.problem.timed import Timed, distance
+from moonteam.problem.timed import Agent, Target, Timed, distance
 
 Int64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
@@ -26,6 +26,11 @@ MS = 1000
 
 NEVER = 1 << 40
 """ms that stand for "no way" and "no limit"; a thousand still add up in int64."""
+
+TRIAL = Timed("seconds", (Agent((0.0, 0.0), ("A",)), Agent((1.0, 0.0), ("B",), 2.0, (0.0, 0.0))), (
+    Target((3.0, 0.0), ("A", "B"), service=1.0), Target((0.0, 3.0), ("A",)),
+    Target((0.0, 4.0), ("A",), after=(0,))))
+"""A problem that takes no time, for what is loaded or compiled at the first call."""
 
 
 @dataclass(frozen=True)

