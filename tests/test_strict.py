@@ -58,7 +58,9 @@ LAUGHS = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
     (LAUGHS, "its aliases stand for too many values"),
     ("a: *b", "found undefined alias 'b'"),
     ("a: 1\n---\na: 2", "but found another document"),
-    ("a: " + "[" * 5_000_000, "is nested too deeply"),
+    ("a: " + "[" * 500_000, "is nested too deeply"),
+    ("a: " + "x" * 524_288, "is too long: 524,291 characters; at most 524,288"),
+    (r'a: "\ud800"', r"holds half a character (\ud800 to \udfff) (line 1)"),
 ])
 def test_yaml_refused_in_one_line(text, problem):
     with pytest.raises(InputError) as refused:
@@ -74,6 +76,8 @@ def test_yaml_refused_in_one_line(text, problem):
     ('{"a": 1e999}', "the number 1e999 is too large"),
     ('{"a": ' + "9" * 5000 + "}", "is too large"), ('{"a": 010}', "not JSON: "),
     ('{"a": 1,}', "not JSON: "), ("[" * 10_000_000, "is nested too deeply"), ("", "not JSON: "),
+    (r'["\ud800"]', r"holds half a character (\ud800 to \udfff)"),
+    (r'{"\uDFFF": 1}', "half a character"), ("1" * 16_777_217, "at most 16,777,216"),
 ])
 def test_json_refused_in_one_line(text, problem):
     with pytest.raises(InputError) as refused:

@@ -18,11 +18,22 @@ from moonteam.strict import json_value
 
 T = TypeVar("T")
 
+_TOO_LONG = re.compile(r"Expected `\w+` of length <= (\d+)")
+
+
+MOST_BYTES = 128 << 20
+"""Of a file of text."""
+
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The file's text. Raises InputError if it is missing, unreadable or not UTF-8."""
+    """The file's text. Raises InputError if it is missing, unreadable, too long or not UTF-8."""
     try:
-        return Path(path).read_text(encoding="utf-8-sig")  # a byte-order mark is no text
+        with Path(path).open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise InputError(path, f"is too long: more than {MOST_BYTES >> 20} MiB of text")
+        text = data.decode("utf-8-sig")  # a byte-order mark is no text
+        return text.replace("\r\n", "\n").replace("\r", "\n")
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
     except IsADirectoryError:
@@ -42,6 +53,7 @@ def convert(value: Any, kind: type[T], source: object, where: str = "") -> T:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         problem, _, path = str(error).partition(" - at `")
+        problem = _TOO_LONG.sub(r"is too long; at most \1", problem)
         key = path.rstrip("`").removeprefix("$").removeprefix(".")
         key = ".".join(part for part in (where, key) if part).replace(".[", "[")
         if problem.startswith("Object contains unknown field"):

@@ -3,7 +3,7 @@
 Plain data only. Refused, each in one line: a key given twice, of which one would be lost; numbers
 that are not finite; whole numbers that YAML 1.1 takes for octal (010) or for minutes (1:30), which
 stay text, as do yes, no and dates; nesting too deep to be read, and aliases that stand for too
-much of it.
+much of it; halves of a character; more text than is worth reading.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ from moonteam.errors import InputError
 
 MOST_NODES = 2_000_000
 """Values of a YAML file with each of its aliases written out."""
+MOST_JSON = 16 << 20
+"""Characters of a JSON text, such as a line of a set: it takes ten times as many bytes."""
+MOST_YAML = 1 << 19
+"""Characters of a YAML text: some ten seconds of reading."""
 DEEP = "is nested too deeply"
+HALF = "holds half a character (\\ud800 to \\udfff)"
+_HALF = re.compile("[\ud800-\udfff]")
+_HALVES = re.compile(r"\\u[dD][89a-fA-F]")
 _INT = re.compile(r"[-+]?(?:0|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|(?:0|[1-9][0-9]*)(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 
@@ -30,9 +37,15 @@ class _Refused(ValueError):
 
 def json_value(text: str, source: object, where: str = "") -> Any:
     """The value of a JSON text. Raises InputError with `where`, or the line and column."""
+    _check_length(text, MOST_JSON, source, where)
     try:
-        return json.loads(text.removeprefix("\ufeff"), object_pairs_hook=_once,
-                          parse_constant=_no_constant, parse_float=_finite, parse_int=_whole)
+        value = json.loads(text.removeprefix("\ufeff"), object_pairs_hook=_once,
+                           parse_constant=_no_constant, parse_float=_finite, parse_int=_whole)
+        if _HALVES.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
+    except UnicodeEncodeError:
+        raise InputError(source, HALF, where) from None
     except json.JSONDecodeError as error:
         place = f"column {error.colno}" if where else f"line {error.lineno}, column {error.colno}"
         raise InputError(source, f"is not JSON: {error.msg} ({place})", where) from None
@@ -40,6 +53,11 @@ def json_value(text: str, source: object, where: str = "") -> Any:
         raise InputError(source, str(error), where) from None
     except RecursionError:
         raise InputError(source, DEEP, where) from None
+
+
+def _check_length(text: str, most: int, source: object, where: str = "") -> None:
+    if len(text) > most:
+        raise InputError(source, f"is too long: {len(text):,} characters; at most {most:,}", where)
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -109,6 +127,7 @@ for _tag, _pattern, _first in (
 
 def yaml_value(text: str, source: object) -> Any:
     """The value of a YAML text, None if it is empty. Raises InputError with the line."""
+    _check_length(text, MOST_YAML, source)
     loader = None
     try:
         loader = _Loader(text)
@@ -134,7 +153,7 @@ def line_of(error: yaml.YAMLError) -> str:
 
 
 def _check(root: yaml.Node) -> None:
-    """Raises ConstructorError for a key given twice, and for aliases without end."""
+    """Raises ConstructorError for a key given twice, half a character, aliases without end."""
     sizes: dict[int, int] = {}  # of what is done; 0 while it is being counted
     way = [(root, False)]
     while way:
@@ -152,6 +171,8 @@ def _check(root: yaml.Node) -> None:
             continue
         if isinstance(node, yaml.MappingNode):
             _check_keys(node)
+        if isinstance(node, yaml.ScalarNode) and _HALF.search(node.value):
+            raise _error(node, HALF)
         sizes[id(node)] = 0
         way.append((node, True))
         way += [(inner, False) for inner in inside]

@@ -7,18 +7,23 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem import scenario, timed
-from moonteam.problem.scenario import Cell
+from moonteam.problem.scenario import MOST_AGENTS, MOST_STEPS, MOST_TARGETS, Cell, Name, Skills
 from moonteam.strict import yaml_value
 
 WHAT = ("lost", "target", "slow", "silent", "impassable")
 """Keys of an event, one of which says what happens."""
+
+MOST_EVENTS = 1024
+MOST_SEED = 2**31 - 1
+SLOWEST = 0.001
+"""m/s that a robot may be slowed down to."""
 
 Place = tuple[int | float, int | float]
 """(x, y) in cells, [0, 0] the centre of the cell in the lower left; a cell where both are whole."""
@@ -45,9 +50,9 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     By the clock it may be slower than its kind (`speed`, m/s) and have a `home` to be back at.
     """
 
-    name: str
+    name: Name
     kind: str
-    skills: tuple[str, ...]
+    skills: Skills
     start: Place
     speed: float | None = None
     home: Place | None = None
@@ -67,12 +72,12 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     """
 
     at: Place
-    skills: tuple[str, ...] = ()
+    skills: Skills = ()
     type: Literal["AND", "OR"] = "OR"
-    name: str | None = None
-    coalition: dict[str, int] = {}
+    name: Name | None = None
+    coalition: timed.Coalition = {}
     service: float = 0.0
-    after: tuple[str, ...] = ()
+    after: Annotated[tuple[str, ...], msgspec.Meta(max_length=MOST_TARGETS)] = ()
     appears: float = 0.0
     lapses: float | None = None
 
@@ -147,12 +152,12 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     """
 
     map: Map
-    robots: tuple[Robot, ...]
-    targets: tuple[Target, ...]
+    robots: Annotated[tuple[Robot, ...], msgspec.Meta(max_length=MOST_AGENTS)]
+    targets: Annotated[tuple[Target, ...], msgspec.Meta(max_length=MOST_TARGETS)]
     site: Site = Site(preset="mare")
-    name: str = ""
+    name: Name = ""
     max_steps: int = 128
-    events: tuple[Event, ...] = ()
+    events: Annotated[tuple[Event, ...], msgspec.Meta(max_length=MOST_EVENTS)] = ()
     clock: Literal["steps", "seconds"] = "steps"
     max_seconds: float = 900.0
 
@@ -193,8 +198,7 @@ def check(mission: Mission, source: object) -> Mission:
         raise InputError(source, "at least one robot is needed", "robots")
     _check_clock(mission, source)
     _as_mission_keys(mission, source)
-    for j, target in enumerate(mission.targets):
-        _check_skills(mission, target, source, f"targets[{j}].skills")
+    _check_skills(mission, mission.targets, source, "targets[{}].skills")
     for e, event in enumerate(mission.events):
         _check_event(mission, event, source, f"events[{e}]")
     return mission
@@ -205,13 +209,13 @@ def _check_clock(mission: Mission, source: object) -> None:
     if mission.clock == "steps":
         _check_steps(mission, source)
         return
-    if not (math.isfinite(mission.max_seconds) and mission.max_seconds > 0):
-        raise InputError(source, f"{mission.max_seconds:g} is not allowed; above 0", "max_seconds")
+    timed.check_limit(mission.max_seconds, lambda p: InputError(source, p, "max_seconds"))
     names = [mission.target_name(j) for j in range(len(mission.targets))]
-    team = [robot.skills for robot in mission.robots]
+    numbers = {name: j for j, name in enumerate(names)}
+    team = timed.headcount(robot.skills for robot in mission.robots)
     for i, robot in enumerate(mission.robots):
-        if robot.speed is not None and not (math.isfinite(robot.speed) and robot.speed > 0):
-            raise InputError(source, f"{robot.speed:g} is not allowed; above 0",
+        if robot.speed is not None and not SLOWEST <= robot.speed < math.inf:
+            raise InputError(source, f"{robot.speed:g} is not allowed; at least {SLOWEST:g}",
                              f"robots[{i}].speed")
         if robot.home is not None:
             _check_cell(mission, cell_of(robot.home), source, f"robots[{i}].home")
@@ -223,10 +227,10 @@ def _check_clock(mission: Mission, source: object) -> None:
             return InputError(source, problem.replace("agent", "robot"), f"{key}.{part}")
 
         for name in target.after:
-            if name not in names or name == names[j]:
+            if name not in numbers or name == names[j]:
                 others = ", ".join(other for other in names if other != names[j])
                 raise fail("after", f"{name!r} is not allowed; other targets: {others}")
-        after.append(tuple(names.index(name) for name in target.after))
+        after.append(tuple(numbers[name] for name in target.after))
         timed.check_times(target, fail)
         timed.check_coalition(target, team, fail)
         if target.lapses is None and target.appears + target.service > mission.max_seconds:
@@ -254,14 +258,13 @@ def _check_steps(mission: Mission, source: object) -> None:
                              "too", key)
 
 
-def _check_skills(mission: Mission, target: Target, source: object, key: str) -> None:
-    """Raises InputError if the team can never solve the target."""
-    alone = msgspec.structs.replace(
-        mission.scenario(), targets=(
-            scenario.Target(target.cell, tuple(target.needs()), "OR" if target.either else "AND"),))
-    for skills in scenario.missing_skills(alone).values():
+def _check_skills(mission: Mission, targets: tuple[Target, ...], source: object, key: str) -> None:
+    """Raises InputError if the team can never solve one of them; `key` has a place for which."""
+    asked = msgspec.structs.replace(mission, targets=targets).scenario()
+    for j, skills in scenario.missing_skills(asked).items():
         raise InputError(source, f"no robot has skill {', '.join(skills) or '?'}; the team has "
-                         + ", ".join(sorted({s for r in mission.robots for s in r.skills})), key)
+                         + ", ".join(sorted({s for r in mission.robots for s in r.skills})),
+                         key.format(j))
 
 
 def _as_mission_keys(mission: Mission, source: object) -> None:
@@ -280,8 +283,8 @@ def _as_mission_keys(mission: Mission, source: object) -> None:
 def _check_site(site: Site, source: object) -> None:
     if (site.preset is None) == (site.dem is None):
         raise InputError(source, "give one of preset and dem", "site")
-    if site.seed < 0:
-        raise InputError(source, f"{site.seed} is not allowed; at least 0", "site.seed")
+    if not 0 <= site.seed <= MOST_SEED:
+        raise InputError(source, f"{site.seed} is not allowed; 0 to {MOST_SEED}", "site.seed")
 
 
 def _check_names(mission: Mission, source: object) -> None:
@@ -309,7 +312,7 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
         _check_robot(mission, event.lost, source, key)
     if event.target is not None:
         _check_cell(mission, event.target.cell, source, f"{key}.at")
-        _check_skills(mission, event.target, source, f"{key}.skills")
+        _check_skills(mission, (event.target,), source, f"{key}.skills")
     if event.slow is not None:
         _check_robot(mission, event.slow.robot, source, f"{key}.robot")
         if not 0.1 <= event.slow.factor <= 1:
@@ -317,12 +320,12 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
                              f"{key}.factor")
     if event.silent is not None:
         _check_robot(mission, event.silent.robot, source, f"{key}.robot")
-        if mission.clock == "steps" and event.silent.decisions < 1:
-            raise InputError(source, f"{event.silent.decisions} is not allowed; at least 1",
+        if mission.clock == "steps" and not 1 <= event.silent.decisions <= MOST_STEPS:
+            raise InputError(source, f"{event.silent.decisions} is not allowed; 1 to {MOST_STEPS}",
                              f"{key}.decisions")
-        if mission.clock == "seconds" and not event.silent.seconds > 0:
-            raise InputError(source, f"{event.silent.seconds:g} is not allowed; above 0",
-                             f"{key}.seconds")
+        if mission.clock == "seconds":
+            timed.check_limit(event.silent.seconds,
+                              lambda problem: InputError(source, problem, f"{key}.seconds"))
     if event.impassable is not None:
         _check_cell(mission, event.impassable.at, source, f"{key}.at")
 
@@ -333,13 +336,14 @@ def _check_when(mission: Mission, event: Event, source: object, key: str) -> Non
         if event.at_decision or event.at_s is None:
             raise InputError(source, "say when: at_s, in seconds; decisions are counted only where "
                              "the clock is steps", key)
-        if not event.at_s >= 0:
-            raise InputError(source, f"{event.at_s:g} is not allowed; at least 0", f"{key}.at_s")
+        if not 0 <= event.at_s <= timed.MOST_SECONDS:
+            raise InputError(source, f"{event.at_s:g} is not allowed; 0 to {timed.MOST_SECONDS:g}",
+                             f"{key}.at_s")
     elif event.at_s is not None:
         raise InputError(source, "is for missions by the clock; say clock: seconds too, or "
                          "at_decision", f"{key}.at_s")
-    elif event.at_decision < 1:
-        raise InputError(source, f"{event.at_decision} is not allowed; at least 1",
+    elif not 1 <= event.at_decision <= MOST_STEPS:
+        raise InputError(source, f"{event.at_decision} is not allowed; 1 to {MOST_STEPS}",
                          f"{key}.at_decision")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -20,15 +20,25 @@ ACTIONS = ("up", "down", "left", "right", "stay")
 """The paper's order: 0 up (+y), 1 down (-y), 2 left (-x), 3 right (+x), 4 stay."""
 
 MAX_SKILLS = 8
+MOST_SIDE = 1024
+"""Cells of a map's side."""
+MOST_AGENTS = 256
+MOST_TARGETS = 1024
+MOST_STEPS = 100_000
+MOST_WAYS = 1 << 28
+"""Steps to each target from each cell by each kind, that maps with closed cells are given."""
 
 Cell = tuple[int, int]
+Name = Annotated[str, msgspec.Meta(max_length=100)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
+Skills = Annotated[tuple[Name, ...], msgspec.Meta(max_length=8 * MAX_SKILLS)]
 
 
 class Agent(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A robot on the grid; `kind` matters only where some cells are blocked for some kinds."""
 
     at: Cell
-    skills: tuple[str, ...]
+    skills: Skills
     kind: str | None = None
 
 
@@ -36,7 +46,7 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A cell that needs skills: any of them (OR), or all at once (AND)."""
 
     at: Cell
-    skills: tuple[str, ...]
+    skills: Skills
     type: Literal["AND", "OR"]
 
 
@@ -47,20 +57,20 @@ class Optimal(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     bounds in `bound_*`.
     """
 
-    makespan: int | None = None
-    moves: int | None = None
-    best_makespan: int | None = None
-    best_moves: int | None = None
-    bound_makespan: int | None = None
-    bound_moves: int | None = None
+    makespan: Count | None = None
+    moves: Count | None = None
+    best_makespan: Count | None = None
+    best_moves: Count | None = None
+    bound_makespan: Count | None = None
+    bound_moves: Count | None = None
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A grid problem. `blocked` maps a kind (or ``*`` for all) to cells it cannot enter."""
 
     size: tuple[int, int]
-    agents: tuple[Agent, ...]
-    targets: tuple[Target, ...]
+    agents: Annotated[tuple[Agent, ...], msgspec.Meta(max_length=MOST_AGENTS)]
+    targets: Annotated[tuple[Target, ...], msgspec.Meta(max_length=MOST_TARGETS)]
     id: str = ""
     max_steps: int = 128
     blocked: dict[str, tuple[Cell, ...]] | None = None
@@ -90,10 +100,10 @@ def check(scenario: Scenario, source: object, where: str = "") -> Scenario:
         return InputError(source, problem, f"{where}.{key}" if where else key)
 
     width, height = scenario.size
-    if not (1 <= width <= 1024 and 1 <= height <= 1024):
-        raise fail("size", f"{list(scenario.size)} is not allowed; each side 1 to 1024")
-    if scenario.max_steps < 1:
-        raise fail("max_steps", f"{scenario.max_steps} is not allowed; at least 1")
+    if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
+        raise fail("size", f"{list(scenario.size)} is not allowed; each side 1 to {MOST_SIDE}")
+    if not 1 <= scenario.max_steps <= MOST_STEPS:
+        raise fail("max_steps", f"{scenario.max_steps} is not allowed; 1 to {MOST_STEPS}")
     if not scenario.agents:
         raise fail("agents", "at least one agent is needed")
     if not scenario.targets:
@@ -116,7 +126,17 @@ def check(scenario: Scenario, source: object, where: str = "") -> Scenario:
     for kind, cells in (scenario.blocked or {}).items():
         for i, cell in enumerate(cells):
             check_cell(cell, scenario.size, lambda p, k=f"blocked.{kind}[{i}]": fail(k, p))
+    if scenario.blocked:
+        kinds = len({agent.kind for agent in scenario.agents})
+        check_ways(scenario.size, kinds, len(scenario.targets), lambda p: fail("size", p))
     return scenario
+
+
+def check_ways(size: tuple[int, int], kinds: int, targets: int, fail) -> None:
+    """Raises `fail(problem)` where maps of the ways to all targets would take too much memory."""
+    if size[0] * size[1] * kinds * targets > MOST_WAYS:
+        raise fail(f"{list(size)} with {kinds} kinds and {targets} targets is too much for maps of "
+                   f"closed cells; at most {MOST_WAYS:,} cells times kinds times targets")
 
 
 def check_cell(cell: Cell, size: tuple[int, int], fail) -> None:

@@ -13,25 +13,37 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.problem.scenario import MAX_SKILLS, Scenario
+from moonteam.problem.scenario import (
+    MAX_SKILLS,
+    MOST_AGENTS,
+    MOST_TARGETS,
+    Name,
+    Scenario,
+    Skills,
+)
 from moonteam.strict import json_value
 
 Place = tuple[float, float]
 Metric = Literal["straight", "manhattan"]
+Coalition = Annotated[dict[Name, int], msgspec.Meta(max_length=8 * MAX_SKILLS)]
+
+MOST_SECONDS = 1e9
+"""Of a way, a service or a limit: planners count milliseconds, and a thousand of these add up."""
 
 
 class Agent(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A robot: where it is, m; its speed, m/s; where it has to be at the end, if anywhere."""
 
     at: Place
-    skills: tuple[str, ...]
+    skills: Skills
     speed: float = 1.0
     home: Place | None = None
     kind: str | None = None
@@ -46,12 +58,12 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     """
 
     at: Place
-    skills: tuple[str, ...] = ()
+    skills: Skills = ()
     type: Literal["AND", "OR"] = "AND"
-    coalition: dict[str, int] = {}
+    coalition: Coalition = {}
     service: float = 0.0
     """s that the coalition stays."""
-    after: tuple[int, ...] = ()
+    after: Annotated[tuple[int, ...], msgspec.Meta(max_length=MOST_TARGETS)] = ()
     """Targets whose services have ended before this one's starts."""
     appears: float = 0.0
     """s before which no service starts; where a mission unfolds, nobody knows of it before."""
@@ -78,8 +90,8 @@ class Timed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     """
 
     clock: Literal["seconds"]
-    agents: tuple[Agent, ...]
-    targets: tuple[Target, ...]
+    agents: Annotated[tuple[Agent, ...], msgspec.Meta(max_length=MOST_AGENTS)]
+    targets: Annotated[tuple[Target, ...], msgspec.Meta(max_length=MOST_TARGETS)]
     id: str = ""
     metric: Metric = "straight"
     max_seconds: float | None = None
@@ -119,13 +131,15 @@ def check(timed: Timed, source: object, where: str = "") -> Timed:
         raise fail("agents", f"{len(timed.skill_names)} different skills; at most "
                    f"{8 * MAX_SKILLS} are allowed")
     if timed.max_seconds is not None:
-        _positive(timed.max_seconds, lambda p: fail("max_seconds", p))
+        check_limit(timed.max_seconds, lambda p: fail("max_seconds", p))
+    team = headcount(agent.skills for agent in timed.agents)
     for i, agent in enumerate(timed.agents):
         _check_agent(agent, lambda key, problem, i=i: fail(f"agents[{i}].{key}", problem))
     for j, target in enumerate(timed.targets):
         say = lambda key, problem, j=j: fail(f"targets[{j}].{key}", problem)
         check_target(target, len(timed.targets), j, say)
-        check_coalition(target, [agent.skills for agent in timed.agents], say)
+        check_coalition(target, team, say)
+    _check_ways(timed, fail)
     for j in after_itself([target.after for target in timed.targets]):
         raise fail(f"targets[{j}].after", "it would come before itself: a circle of targets that "
                    "wait for each other")
@@ -145,24 +159,33 @@ def check_target(target: Target, count: int, index: int, fail: Any) -> None:
 
 def check_times(target: Any, fail: Any) -> None:
     """A target's seconds, be it a scenario's or a mission's. Raises `fail(key, problem)`."""
-    if not (math.isfinite(target.service) and target.service >= 0):
-        raise fail("service", f"{target.service:g} is not allowed; seconds, at least 0")
-    if not (math.isfinite(target.appears) and target.appears >= 0):
-        raise fail("appears", f"{target.appears:g} is not allowed; seconds, at least 0")
-    if target.lapses is not None and not target.lapses >= target.appears:
+    for key, value in (("service", target.service), ("appears", target.appears)):
+        if not 0 <= value <= MOST_SECONDS:
+            raise fail(key, f"{value:g} is not allowed; seconds, at least 0, at most "
+                       f"{MOST_SECONDS:g}")
+    if target.lapses is not None and not target.appears <= target.lapses <= MOST_SECONDS:
         raise fail("lapses", f"{target.lapses:g} is not allowed; at least `appears`, "
-                   f"{target.appears:g}: it would lapse before it appears")
+                   f"{target.appears:g}: it would lapse before it appears; at most "
+                   f"{MOST_SECONDS:g}")
 
 
-def check_coalition(target: Any, team: Iterable[tuple[str, ...]], fail: Any) -> None:
-    """Raises `fail(key, problem)` for a coalition that the team can never form."""
-    team = list(team)
+def check_limit(seconds: float, fail: Any) -> None:
+    """Raises `fail(problem)` for a limit that is no time."""
+    if not 0 < seconds <= MOST_SECONDS:
+        raise fail(f"{seconds:g} is not allowed; above 0, at most {MOST_SECONDS:g}")
+
+
+def headcount(team: Iterable[tuple[str, ...]]) -> Counter[str]:
+    """How many of the team have each skill."""
+    return Counter(skill for its in team for skill in set(its))
+
+
+def check_coalition(target: Any, have: Counter[str], fail: Any) -> None:
+    """Raises `fail(key, problem)` for a coalition that the team, counted, can never form."""
     if target.coalition and target.skills:
         raise fail("coalition", "give skills or coalition, not both")
     if not target.coalition and (not target.skills or "" in target.skills):
         raise fail("skills", "at least one non-empty skill name is needed, or a coalition")
-    have = {skill: sum(skill in its for its in team)
-            for skill in {*target.skills, *target.coalition}}
     for skill, number in target.coalition.items():
         if number < 1:
             raise fail(f"coalition.{skill}", f"{number} is not allowed; at least 1")
@@ -172,17 +195,23 @@ def check_coalition(target: Any, team: Iterable[tuple[str, ...]], fail: Any) -> 
     lacking = [skill for skill in target.skills if not have[skill]]
     if lacking and (target.type == "AND" or len(lacking) == len(set(target.skills))):
         raise fail("skills", f"no agent has {', '.join(sorted(lacking))}; the team has "
-                   + ", ".join(sorted({skill for its in team for skill in its})))
+                   + ", ".join(sorted(have)))
 
 
 def after_itself(after: list[tuple[int, ...]]) -> list[int]:
     """Targets on a circle of `after`, in order; empty where there is none."""
-    left = set(range(len(after)))
-    while True:
-        free = [j for j in left if not left & set(after[j])]
-        if not free:
-            return sorted(left)
-        left -= set(free)
+    waits = [set(before) for before in after]
+    later: list[list[int]] = [[] for _ in after]
+    for j, before in enumerate(waits):
+        for k in before:
+            later[k].append(j)
+    free = [j for j, before in enumerate(waits) if not before]
+    for k in free:
+        for j in later[k]:
+            waits[j].discard(k)
+            if not waits[j]:
+                free.append(j)
+    return sorted(set(range(len(after))) - set(free))
 
 
 def distance(a: Place, b: Place, metric: Metric) -> float:
@@ -236,7 +265,7 @@ def _clocked(line: str) -> bool | None:
     """Whether it is an object with a key `clock`; None if it is no JSON."""
     try:
         value = msgspec.json.decode(line)
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, RecursionError):
         return None
     return isinstance(value, dict) and "clock" in value
 
@@ -250,8 +279,23 @@ def _check_agent(agent: Agent, fail: Any) -> None:
         raise fail("skills", "a skill name is empty")
 
 
+def _check_ways(timed: Timed, fail: Any) -> None:
+    """Raises for ways that take longer than planners can count."""
+    places = [*(a.at for a in timed.agents), *(a.home for a in timed.agents if a.home),
+              *(t.at for t in timed.targets)]
+    wide = sum(max(along) - min(along) for along in zip(*places, strict=True))
+    for i, agent in enumerate(timed.agents):
+        if not wide / agent.speed <= MOST_SECONDS:
+            raise fail(f"agents[{i}].speed", f"{agent.speed:g} is too slow: ways may take up to "
+                       f"{wide / agent.speed:g} s; at most {MOST_SECONDS:g}")
+
+
 def _check_windows(timed: Timed, fail: Any) -> None:
     """Raises for a window that is over before anybody who is needed can be there."""
+    who: dict[str, list[int]] = {}
+    for i, agent in enumerate(timed.agents):
+        for skill in set(agent.skills):
+            who.setdefault(skill, []).append(i)
     for j, target in enumerate(timed.targets):
         closes = target.lapses
         if timed.max_seconds is not None:
@@ -259,18 +303,20 @@ def _check_windows(timed: Timed, fail: Any) -> None:
             closes = last if closes is None else min(closes, last)
         if closes is None:
             continue
-        soonest = _soonest(timed, target)
+        soonest = _soonest(timed, target, who)
         if soonest > closes + 1e-9:
             key = "lapses" if target.lapses is not None and closes == target.lapses else "at"
             raise fail(f"targets[{j}].{key}", f"{closes:g} s is over before it can be reached: its "
                        f"coalition can be there at {soonest:.3f} s at the soonest")
 
 
-def _soonest(timed: Timed, target: Target) -> float:
-    """s at which a coalition can be at the target if everybody goes straight there."""
-    arrivals = {skill: sorted(distance(a.at, target.at, timed.metric) / a.speed
-                              for a in timed.agents if skill in a.skills)
-                for skill in target.needs()}
+def _soonest(timed: Timed, target: Target, who: dict[str, list[int]]) -> float:
+    """s at which a coalition can be at the target if everybody goes straight there.
+
+    `who` has which skill.
+    """
+    there = [distance(a.at, target.at, timed.metric) / a.speed for a in timed.agents]
+    arrivals = {skill: sorted(there[i] for i in who.get(skill, ())) for skill in target.needs()}
     times = [found[number - 1] for skill, number in target.needs().items()
              if len(found := arrivals[skill]) >= number]
     either = not target.coalition and target.type == "OR"
