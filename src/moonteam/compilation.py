@@ -103,7 +103,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         try:
             made: Any = numba.njit(**options)(function)
         except RuntimeError:
-            return numba.njit(**options | {"cache": False})(function)
+            uncached: dict[str, Any] = options | {"cache": False}
+            return numba.njit(**uncached)(function)
         save = made._cache.save_overload
 
         def save_if_possible(signature: Any, data: Any) -> None:
