@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
 from moonteam.commands.options import Missions, Planning, Reported, Resumable
-from moonteam.report import command
+from moonteam.report import command, journal
 from moonteam.report.command import Aside
+from moonteam.report.journal import Journal
 from moonteam.report.progress import say
-from sim2grid.study import journal
-from sim2grid.study.journal import Journal
 
 if TYPE_CHECKING:
     from sim2grid.study.evaluation import Evaluation, Row

@@ -10,9 +10,8 @@ import msgspec
 
 from moonteam import files
 from moonteam.commands.options import Missions, Planning, Reported, Resumable
-from moonteam.report import command
-from sim2grid.study import journal
-from sim2grid.study.journal import Journal
+from moonteam.report import command, journal
+from moonteam.report.journal import Journal
 
 if TYPE_CHECKING:
     from sim2grid.study.evaluation import Row

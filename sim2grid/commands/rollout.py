@@ -13,7 +13,7 @@ import msgspec
 import numpy.typing as npt
 import tyro
 
-from moonteam import files, loading, outputs
+from moonteam import files, interrupts, loading, outputs
 from moonteam.commands.options import Forced, Planning, Printed
 from moonteam.errors import InputError
 from moonteam.problem.mission import Mission
@@ -127,7 +127,7 @@ def run(args: Args) -> int:
     if done.interrupted:
         print(f"moonteam: stopped after {report.seconds:g} s of the mission; "
               f"{done.out}/report.json holds what was done", file=sys.stderr)
-        return 130
+        return interrupts.CODE
     if args.json:
         print(files.dump_json(report))
     else:
@@ -311,6 +311,7 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
 
         def look() -> None:
             looks.append(time.perf_counter())
+            interrupts.hold()
             solved = int(execution.snapshot.solved.sum())
             update(solved, f"{execution.book.time:.1f} s, decision {execution.book.decision}, "
                            f"{solved} of {len(execution.record.targets)} targets")

@@ -27,6 +27,7 @@ from typing import Any, Literal, cast
 import msgspec
 import numpy as np
 
+from moonteam import interrupts
 from moonteam.errors import InputError
 from moonteam.physics.backends import MjxBackend
 from moonteam.planners import registry
@@ -329,6 +330,7 @@ class Group:
                   site_seed=recipe.seed, seed=report.seed, slot=k % self._width,
                   solvable=not by_event, nominal_s=nominal_s, report=report)
         self._all.rows[contender.name, row.number] = row
+        interrupts.hold()
         self._all.keep(row)
 
     def _on_grid(self, contender: Contender, make: Callable[[], Planner],

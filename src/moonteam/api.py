@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from moonteam import files, loading, outputs
+from moonteam import files, interrupts, loading, outputs
 from moonteam.errors import InputError
 from moonteam.loading import load
 from moonteam.problem.mission import Mission
@@ -170,7 +170,7 @@ def train(preset: str, *words: str, out: Named | None = None) -> Path:
                          ) from None
     folder = command.folder(args)
     code = command.run(args)
-    if code == 130:
+    if code == interrupts.CODE:
         raise KeyboardInterrupt
     if code:
         raise RuntimeError(f"training {preset} ended with exit code {code}")

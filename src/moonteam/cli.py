@@ -3,8 +3,8 @@
 A command module holds `Args`, a frozen dataclass whose docstring is the help text and
 whose fields tyro reads, `run(args) -> int`, which returns the exit code, and, where it writes into
 a folder `--out`, `FILES`: their names, for which the folder is held while it runs.
-Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 interrupted, 141
-whoever read the output (`| head`) went away.
+Exit codes: 0 done, 1 ran but the mission failed, 2 bad input or usage, 130 interrupted by Ctrl-C
+or SIGTERM (`interrupts`), 141 whoever read the output (`| head`) went away.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import os
 import sys
 from typing import Any
 
-from moonteam import compilation
+from moonteam import compilation, interrupts
 from moonteam.errors import InputError
 from moonteam.version import __version__
 
@@ -92,8 +92,15 @@ def parse(name: str, words: list[str]) -> Any:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
+    """Runs one command; returns its exit code. Without `argv` the process is the command's own."""
+    if argv is not None:
+        return _guarded(argv)
+    with interrupts.handled():
+        return _guarded(sys.argv[1:])
+
+
+def _guarded(words: list[str]) -> int:
+    """The exit code, whatever is raised."""
     try:
         try:
             return _run(words)
@@ -103,13 +110,14 @@ def main(argv: list[str] | None = None) -> int:
         print(f"moonteam: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("moonteam: interrupted", file=sys.stderr)
-        return 130
+        return interrupts.say()
     except BrokenPipeError:
         # What is still in the buffer has no reader: Python must not try to write it at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except Exception as error:
+        if interrupts.asked():
+            return interrupts.say()
         problem = _unwritable(error) or _surroundings()
         if problem is None:
             raise

@@ -74,7 +74,8 @@ def test_exact_is_optimal_in_both_objectives_and_greedy_never_better(capsys, tmp
         assert row["moves"] >= row["optimal"]["moves"]
     assert set(document["meta"]) == {"command", "seed", "commit", "versions", "hardware"}
     files = {p.name for p in (tmp_path / "run").iterdir()}
-    assert files == {"report.json", "summary.csv", "rows.csv", "table.md", "gaps.png"}
+    assert files == {"report.json", "summary.csv", "rows.csv", "table.md", "gaps.png",
+                     "config.json", "rows.jsonl"}
     assert json.loads((tmp_path / "run" / "report.json").read_text()) == document
     assert (tmp_path / "run" / "rows.csv").read_text().count("\n") == 41
     assert (tmp_path / "run" / "gaps.png").read_bytes()[:4] == b"\x89PNG"
@@ -187,10 +188,10 @@ def test_replanning_has_the_oracle_and_both_forms(capsys, tmp_path):
 def test_interrupted_what_is_done_is_saved(capsys, monkeypatch, tmp_path):
     whole = Planned.run
 
-    def run(self, world):
+    def run(self, world, kept):
         if self.kind == "greedy":
             raise KeyboardInterrupt
-        return whole(self, world)
+        return whole(self, world, kept)
 
     monkeypatch.setattr(Planned, "run", run)
     words = ["evaluate", "grid", str(GOLDEN), "--limit", "3", "--out", str(tmp_path / "out")]
@@ -200,6 +201,68 @@ def test_interrupted_what_is_done_is_saved(capsys, monkeypatch, tmp_path):
     assert [row["planner"] for row in saved["summary"]] == ["exact(makespan)"]
     assert main([*words[:-1], str(tmp_path / "none"), "--planner", "greedy"]) == 130
     assert not (tmp_path / "none").exists()
+
+
+def resumed(tmp_path, words, keep):
+    """Files of a command's whole run, and of one whose rows were cut off behind the first `keep`
+    and half a line, and that was gone on with.
+    """
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert main([*words, "--out", str(whole)]) == 0
+    parts.mkdir()
+    (parts / "config.json").write_bytes((whole / "config.json").read_bytes())
+    lines = (whole / "rows.jsonl").read_text().splitlines(keepends=True)
+    assert len(lines) > keep
+    (parts / "rows.jsonl").write_text("".join(lines[:keep]) + lines[keep][:10])
+    assert main([*words, "--resume", "--out", str(parts)]) == 0
+    again = (parts / "rows.jsonl").read_text().splitlines(keepends=True)
+    assert again[:keep] == lines[:keep]
+    assert [json.loads(line)[0] for line in again] == [json.loads(line)[0] for line in lines]
+    return whole, parts
+
+
+@pytest.mark.parametrize("more", [
+    ("grid", str(GOLDEN), "--limit", "4", "--planner", "exact", "--planner", "greedy"),
+    ("grid", "seconds/3x5-7", "--limit", "4", "--planner", "exact", "--planner", "greedy"),
+    ("sets", "2x3", "3x5", "--limit", "3", "--planner", "exact")])
+def test_rows_that_are_done_are_not_done_again(tmp_path, capsys, more):
+    whole, parts = (json.loads((folder / "report.json").read_text())
+                    for folder in resumed(tmp_path, ["evaluate", *more], 5))
+    plain = [[{k: v for k, v in row.items() if "seconds" not in k and k != "intervals"}
+              for row in document["summary"]] for document in (whole, parts)]
+    assert plain[0] == plain[1]
+    assert [{k: v for k, v in row.items() if k != "seconds"} for row in parts["rows"]] == [
+        {k: v for k, v in row.items() if k != "seconds"} for row in whole["rows"]]
+
+
+def test_a_policys_batch_is_kept_as_a_whole(tmp_path, capsys, any_team):
+    words = ["evaluate", "grid", "2x3", "--limit", "3", "--planner", "policy", "--policy",
+             any_team, "--planner", "greedy"]
+    whole, parts = (json.loads((folder / "report.json").read_text())
+                    for folder in resumed(tmp_path, words, 1))
+    assert parts["summary"][0] == whole["summary"][0]  # its seconds too
+    assert parts["rows"] == whole["rows"]
+
+
+def test_peers_go_on_too(tmp_path, capsys):
+    words = ["evaluate", "peers", "peers/mrta-benchmark", "--limit", "3", "--planner", "exact"]
+    whole, parts = (json.loads((folder / "peers.json").read_text())
+                    for folder in resumed(tmp_path, words, 2))
+    assert parts["rows"] == whole["rows"]
+    assert parts["sets"][0]["against"] == whole["sets"][0]["against"]
+
+
+def test_going_on_needs_the_folder_and_the_same_options(tmp_path, capsys):
+    words = ["evaluate", "grid", str(GOLDEN), "--limit", "3", "--planner", "greedy"]
+    assert main([*words, "--resume"]) == 2
+    assert "--resume: needs the folder" in capsys.readouterr().err
+    out = ["--out", str(tmp_path / "out")]
+    assert main([*words, "--resume", *out]) == 2
+    assert "holds no run to go on with" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main([*words, *out]) == 0
+    assert main([*words, *out, "--resume", "--seed", "1"]) == 2
+    assert "made with other options: seed" in capsys.readouterr().err
 
 
 def broken(tmp_path, text):

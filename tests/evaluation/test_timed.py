@@ -127,7 +127,7 @@ def test_the_registry_says_what_is_no_planner():
 @pytest.mark.parametrize("name", ["exact", "greedy", "lns", "exhaustive"])
 def test_planners_of_ours_are_found_and_take_their_options(name):
     planner = registry.find(name).make(PlannerOptions(time_limit=0.2, seed=3))
-    now = base.moment(timed.WARM)
+    now = base.moment(base.TRIAL)
     plan = planner.plan(now)
     assert base.problems(now, plan.services) == []
     assert plan.makespan == base.makespan(now, plan.services)
@@ -163,7 +163,8 @@ def test_evaluate_grid_takes_a_set_by_the_clock(capsys, tmp_path):
     assert set(document["rows"][0]) >= {"id", "planner", "success", "makespan", "effort",
                                         "seconds", "optimal"}
     assert {p.name for p in tmp_path.iterdir()} == {
-        "report.json", "summary.csv", "rows.csv", "table.md", "gaps.png"}
+        "report.json", "summary.csv", "rows.csv", "table.md", "gaps.png", "config.json",
+        "rows.jsonl"}
     header, first, *_ = (tmp_path / "rows.csv").read_text().splitlines()
     assert header == "id,planner,success,makespan,effort,seconds,status,optimal_makespan"
     assert first.startswith("1p_000000,Nearest(makespan),1,")
@@ -188,7 +189,8 @@ def test_evaluate_peers_holds_ours_against_every_published_column(capsys, tmp_pa
     row = document["rows"][-1]
     assert (row["set"], row["id"], row["published"]) == (
         "mrta-benchmark", "1p_000001", {"MILP": 541.91373})
-    assert {p.name for p in tmp_path.iterdir()} == {"peers.json", "table.md", "rows.csv"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "peers.json", "table.md", "rows.csv", "rows.jsonl", "config.json"}
     assert len((tmp_path / "rows.csv").read_text().splitlines()) == 1 + 2 * (5 + 2 + 2)
 
 

@@ -7,10 +7,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from moonteam import files, outputs
+from moonteam import files, interrupts, outputs
 from moonteam.commands.options import Printed, RunFolder, Seeded
 from moonteam.report.command import Aside
-from training.run.machine import FILES, Diverged, Run, stop_on_signals
+from training.run.machine import FILES, Diverged, Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,15 +50,20 @@ class Taught(Seeded, Watched):
 def complete(run: Run, json: bool) -> int:
     """Trains to the end, or until stopped, and reports; returns the exit code."""
     try:
-        with stop_on_signals() as stop:
+        with interrupts.postponed() as stop:
             finished = run.train(stop)
+    except KeyboardInterrupt:
+        following = run.position.total_updates + 1
+        print(f"moonteam: interrupted before {run.trainee.unit} {following} was done; go on with "
+              f"--out {run.out} --resume", file=sys.stderr)
+        return interrupts.CODE
     except Diverged as error:
         print(f"moonteam: {error}", file=sys.stderr)
         return 1
     if not finished:
         print(f"moonteam: interrupted after {run.trainee.unit} {run.position.total_updates}, "
               f"saved; go on with --out {run.out} --resume", file=sys.stderr)
-        return 130
+        return interrupts.CODE
     report = run.finish()
     if json:
         print(files.dump_json(report | {"out": str(run.out), "config": run.trainee.recipe}))

@@ -9,12 +9,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +18,9 @@ import jax
 import msgspec
 import numpy as np
 
-from moonteam import files, outputs
+from moonteam import files, interrupts, outputs
 from moonteam.errors import InputError
+from moonteam.interrupts import Stop
 from moonteam.policies.policy_file import save_policy
 from moonteam.report.progress import bar
 from moonteam.report.provenance import commit
@@ -42,32 +39,6 @@ class Diverged(Exception):
     """Training produced something that is not a number, or a policy that lost what it could;
     says which checkpoint is good.
     """
-
-
-@dataclass
-class Stop:
-    """Set by Ctrl-C or SIGTERM; looked at between chunks."""
-
-    asked: bool = False
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[Stop]:
-    """Turns Ctrl-C and SIGTERM into a request, so that the running chunk is finished first."""
-    stop = Stop()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def ask(number: int, frame: object) -> None:
-        stop.asked = True
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class Run:
@@ -209,6 +180,7 @@ class Run:
         row = dataclasses.asdict(position) | {"rate": made.env_steps / seconds} | made.figures
         row |= trainee.held_out(position)
         self.metrics.add(row)
+        interrupts.hold()
         return row
 
     def _check_finite(self, figures: dict[str, float]) -> None:

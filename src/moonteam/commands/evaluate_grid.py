@@ -10,18 +10,20 @@ from typing import Any
 
 import tyro
 
-from moonteam import compilation, loading, paths
-from moonteam.commands.options import Drawn, Limited, Many, Reported
+from moonteam import compilation, interrupts, loading, paths
+from moonteam.commands.options import Drawn, Limited, Many, Reported, Resumable
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
+from moonteam.report.journal import NOTHING, Kept
 
-FILES = ("report.json", "summary.csv", "rows.csv", "table.md", "gaps.png")
+FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", "table.md",
+         "gaps.png")
 """In --out."""
 
 
 @dataclass(frozen=True)
-class Args(Drawn, Limited, Reported):
+class Args(Drawn, Limited, Resumable, Reported):
     """Play a set of scenarios with any number of planners and compare them with the optimum.
 
     One row a planner and objective, or a policy and decoding: success, slack metrics and
@@ -34,7 +36,8 @@ class Args(Drawn, Limited, Reported):
     own unit of time, and planners are those by the clock: exact, greedy, lns, cpsat, exhaustive,
     and policy with a network that points at targets.
 
-    Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png.
+    Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png; and rows.jsonl, to
+    which each plan is added as it is made (a policy's batch as a whole), so that --resume goes on.
 
     Examples:
       moonteam evaluate grid 3x5 --planner exact --planner greedy --limit 200
@@ -135,28 +138,31 @@ def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
     if "interrupted" not in document:
         return 0
     left = ", ".join(document["interrupted"])
-    print(f"moonteam: interrupted; the report lacks {left}", file=sys.stderr)
-    return 130
+    more = "; --resume goes on" if args.out and hasattr(args, "resume") else ""
+    print(f"moonteam: interrupted; the report lacks {left}{more}", file=sys.stderr)
+    return interrupts.CODE
 
 
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.report import command
+    from moonteam.report import command, journal
 
     found, title = _scenarios(args)
-    document, form = judged(found, options_of(args), args.seed, title,
-                            command.line("evaluate grid", args))
+    options = options_of(args)
+    kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
+    document, form = judged(found, options, args.seed, title, command.line("evaluate grid", args),
+                            kept)
     return deliver(args, document, form, "gaps.png")
 
 
 def judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str,
-           line: str) -> tuple[dict, Any]:
+           line: str, kept: Kept = NOTHING) -> tuple[dict, Any]:
     """The report on scenarios in steps or by the clock, and the module that says its form."""
     from moonteam.evaluation import contenders, grid, timed
 
     clocked = [one for one in found if isinstance(one, Timed)]
     if clocked:
-        return timed.evaluate(clocked, timed.contenders(options), seed, title, line), timed
+        return timed.evaluate(clocked, timed.contenders(options), seed, title, line, kept), timed
     steps = [one for one in found if isinstance(one, Scenario)]
-    return grid.evaluate(steps, contenders.contenders(options), seed, title, line), grid
+    return grid.evaluate(steps, contenders.contenders(options), seed, title, line, kept), grid

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import tyro
 
-from moonteam import compilation, files, loading, paths
-from moonteam.commands.options import Limited, Many, Reported, Seeded
+from moonteam import compilation, files, interrupts, loading, paths
+from moonteam.commands.options import Limited, Many, Reported, Resumable, Seeded
 from moonteam.errors import InputError
 from moonteam.problem.timed import Timed
 
-FILES = ("peers.json", "table.md", "rows.csv")
+FILES = ("config.json", "rows.jsonl", "peers.json", "table.md", "rows.csv")
 """In --out."""
 
 
 @dataclass(frozen=True)
-class Args(Seeded, Limited, Reported):
+class Args(Seeded, Limited, Resumable, Reported):
     """Plan others' instances and hold the makespans against the published ones, one by one.
 
     Means and paired differences have 95 % bootstrap intervals; beside them in how many problems
@@ -28,7 +28,8 @@ class Args(Seeded, Limited, Reported):
     Without SETS, the bundled beginnings of three sets (docs/peers.md says where the rest is and
     how it is read). Options marked "again" may be given several times.
 
-    Files in --out: peers.json, table.md and rows.csv.
+    Files in --out: peers.json, table.md and rows.csv; and rows.jsonl, to which each plan is added
+    as it is made, so that --resume goes on.
 
     Examples:
       moonteam evaluate peers
@@ -77,13 +78,14 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.commands.evaluate_grid import options_of
     from moonteam.evaluation import peers
-    from moonteam.report import command, provenance, tables
+    from moonteam.report import command, journal, provenance, tables
 
     sets = {Path(name).stem: load(name, args.limit) for name in args.sets or bundled()}
     asked = replace(options_of(args), planners=args.planner)
     rows = {name: peers.contenders(found, asked)
             for name, found in sets.items()}
-    done, lacking = peers.run_all(sets, rows, args.seed)
+    kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
+    done, lacking = peers.run_all(sets, rows, args.seed, kept)
     document: dict = {
         "title": "beside others", "sets": [part["summary"] for part in done],
         "rows": [row for part in done for row in part["rows"]],
@@ -98,4 +100,4 @@ def run(args: Args) -> int:
     if not lacking:
         return 0
     print(f"moonteam: interrupted; the report lacks {', '.join(lacking)}", file=sys.stderr)
-    return 130
+    return interrupts.CODE

@@ -12,22 +12,23 @@ from typing import Any
 import msgspec
 import tyro
 
-from moonteam import compilation, paths
-from moonteam.commands.options import Limited, Many, Reported, Seeded
+from moonteam import compilation, interrupts, paths
+from moonteam.commands.options import Limited, Many, Reported, Resumable, Seeded
 from moonteam.errors import InputError
 from moonteam.planners import registry
 from moonteam.planners.kind import DEFAULT_POLICY
+from moonteam.report.journal import Kept
 
 POLICY = "policy"
 Who = tuple[str, Path | None]
 """A planner, and the policy file where it is the policy."""
 
-FILES = ("report.json", "summary.csv", "rows.csv", "table.md")
+FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", "table.md")
 """In --out."""
 
 
 @dataclass(frozen=True)
-class Args(Seeded, Limited, Reported):
+class Args(Seeded, Limited, Resumable, Reported):
     """Play the bundled scenario sets with a policy or planner, whatever their teams and targets.
 
     Columns of a policy: decided step by step (argmax with the deadlock watch) at preference 0 and
@@ -35,7 +36,8 @@ class Args(Seeded, Limited, Reported):
     makespan, and under preference 1 fewest moves. Gaps are mean makespan and mean moves over the
     mean optimum, or over the best known values where optima are not proved.
 
-    Files in --out: report.json, summary.csv, rows.csv and table.md.
+    Files in --out: report.json, summary.csv, rows.csv and table.md; and rows.jsonl, to which each
+    plan is added as it is made (a policy's batch as a whole), so that --resume goes on.
 
     Examples:
       moonteam evaluate sets --policy any_team
@@ -60,16 +62,18 @@ class Args(Seeded, Limited, Reported):
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the policy achieved, 130 if interrupted."""
     compilation.enable_cache()
-    from moonteam.report import command, provenance, tables
+    from moonteam.report import command, journal, provenance, tables
 
     found = _who(args)
     sets = args.sets or _bundled()
     _check(found, sets)
+    kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
     rows, left = [], [(name, who) for name in sets for who in found]
     try:
         while left:
-            rows.append(_row(*left[0], args, len(found) > 1))
+            rows.append(_row(*left[0], args, len(found) > 1, kept))
             del left[0]
+            interrupts.hold()
     except KeyboardInterrupt:
         lacking = ", ".join(name for name, _ in left)
         print(f"moonteam: interrupted; the report lacks {lacking}", file=sys.stderr)
@@ -85,7 +89,7 @@ def run(args: Args) -> int:
     if args.out:
         tables.save(args.out, document, columns)
     tables.print_columns(args, document, columns, columns)
-    return 130 if left else 0
+    return interrupts.CODE if left else 0
 
 
 def _bundled() -> list[str]:
@@ -125,7 +129,7 @@ def _check(found: list[Who], sets: Sequence[str]) -> None:
                                  f"{largest}; name the sets to play")
 
 
-def _row(name: str, who: Who, args: Args, several: bool) -> dict:
+def _row(name: str, who: Who, args: Args, several: bool, kept: Kept) -> dict:
     """One set: the figures of three ways to use a policy, or two to use a planner."""
     from moonteam.commands.evaluate_grid import load_set, options_of
     from moonteam.evaluation import grid
@@ -150,7 +154,9 @@ def _row(name: str, who: Who, args: Args, several: bool) -> dict:
     got: dict = {}
     for suffix, way in ways.items():
         rows = contenders(options_of(SimpleNamespace(**vars(asked) | way)))
-        got = grid.evaluate(found, rows, args.seed, name, "")["summary"][0]
+        document = grid.evaluate(found, rows, args.seed, name, "",
+                                 kept.within(name, label, suffix))
+        got = document["summary"][0]
         row |= {key + suffix: got[key] for key in got if isinstance(got[key], float)}
         row["intervals"] |= {key + suffix: pair for key, pair in got["intervals"].items()}
     if policy is None:  # a planner has no best of K

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -30,11 +30,14 @@ from moonteam.planners.decode import Decode
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerKind, PlannerOptions
 from moonteam.policies.brain import PointerBrain
 from moonteam.policies.policy import Policy
+from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.progress import track
 
 POLICY = "policy"
 """The planner whose rows are played in batches, one for each decoding."""
 MAKESPAN: tuple[Objective, ...] = ("makespan",)
+Timed = tuple[list[list[int]], float]
+"""Joint actions of a plan, and the seconds that it took."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +76,8 @@ class Contender(Protocol):
         """Raises InputError if it cannot serve these scenarios."""
         ...
 
-    def run(self, world: World) -> Outcomes:
-        """Plans and plays every scenario."""
+    def run(self, world: World, kept: Kept = NOTHING) -> Outcomes:
+        """Plans and plays every scenario; what is planned is noted in `kept`, or taken from it."""
         ...
 
 
@@ -100,35 +103,42 @@ class Planned:
         if allowed is not None and len(most.targets) - world.num_buffer > allowed:
             self.planner.plan(Snapshot.start(most))
 
-    def run(self, world: World) -> Outcomes:
+    def run(self, world: World, kept: Kept = NOTHING) -> Outcomes:
         """See `Contender`; plans round by round, a round ends where a target appears."""
         spent, first_call = 0.0, 0.0
 
         def plan(moments: list[Snapshot], over: BoolArray, round_: int) -> list[IntArray]:
             nonlocal spent, first_call
             title = f"{self.name} {round_ + 1}" if world.num_buffer else self.name
-            plans, seconds = self._plan_all(moments, over, title, warm=round_ == 0)
+            plans, seconds = self._plan_all(moments, over, title, round_,
+                                            kept.within(self.name, str(round_)))
             spent, first_call = spent + sum(seconds[1:]), first_call + seconds[0]
             return plans
 
         walk = play_plans(world, plan)
         return Outcomes(self.name, *tally(world, walk), spent, first_call)
 
-    def _plan_all(self, moments: list[Snapshot], over: BoolArray, title: str,
-                  warm: bool) -> tuple[list[IntArray], list[float]]:
+    def _plan_all(self, moments: list[Snapshot], over: BoolArray, title: str, round_: int,
+                  kept: Kept) -> tuple[list[IntArray], list[float]]:
         """Plans for every episode that goes on; seconds of each, the first call's in front."""
         seconds = [0.0]
-        if warm and not over.all():  # what is loaded or compiled at the first call
+        left = [i for i in np.flatnonzero(~over).tolist() if not kept.has(str(i))]
+        if round_ == 0 and left:  # what is loaded or compiled at the first call
             began = time.perf_counter()
-            self._actions(moments[int(np.argmin(over))])
+            self._actions(moments[left[0]])
             seconds[0] = time.perf_counter() - began
         plans = []
-        for moment, ended in track(zip(moments, over, strict=True), title, len(moments)):
-            began = time.perf_counter()
-            plans.append(self._actions(moment)[:moment.max_steps] if not ended
-                         else np.zeros((0, len(moment.cells)), np.int32))
-            seconds.append(time.perf_counter() - began)
+        for i, moment in track(enumerate(moments), title, len(moments)):
+            actions, spent = ([], 0.0) if over[i] else kept.once(
+                (str(i),), Timed, lambda moment=moment: self._timed(moment))
+            plans.append(np.array(actions, np.int32).reshape(-1, len(moment.cells)))
+            seconds.append(spent)
         return plans, seconds
+
+    def _timed(self, moment: Snapshot) -> Timed:
+        began = time.perf_counter()
+        actions = self._actions(moment)[:moment.max_steps]
+        return actions.tolist(), time.perf_counter() - began
 
     def _actions(self, moment: Snapshot) -> IntArray:
         """The plan's joint actions; where there is none, what the planner does nevertheless."""
@@ -162,8 +172,15 @@ class Learned:
         for moment in snapshots(world, world.start):
             self.policy.check(moment)
 
-    def run(self, world: World) -> Outcomes:
-        """See `Contender`."""
+    def run(self, world: World, kept: Kept = NOTHING) -> Outcomes:
+        """See `Contender`; kept as a whole, for it is played in one batch."""
+        found = kept.once((self.name,), dict[str, Any], lambda: vars(self._run(world)))
+        return Outcomes(**found | {
+            "success": np.asarray(found["success"], bool),
+            "steps": np.asarray(found["steps"], np.int64),
+            "moves": np.asarray(found["moves"], np.int64)})
+
+    def _run(self, world: World) -> Outcomes:
         options = self.options
         played = play(self.policy, world, self.decode,
                       options.of(self.objective, preference=self.preference), self.name,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from moonteam import interrupts
 from moonteam.evaluation import metrics, optima
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Contender
@@ -11,6 +12,7 @@ from moonteam.evaluation.world import World
 from moonteam.problem.scenario import Scenario
 from moonteam.report import provenance, tables
 from moonteam.report.intervals import RESAMPLES, Bootstrap
+from moonteam.report.journal import NOTHING, Kept
 
 PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
           ("moves_gap", "moves over the optimum, %", 100.0),
@@ -21,8 +23,8 @@ PAGE = tuple(c for c in COLUMNS if c.key not in ("M_st", "M_tte", "decisions"))
 
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int, title: str,
-             command: str) -> dict:
-    """The whole report as a JSON-able document.
+             command: str, kept: Kept = NOTHING) -> dict:
+    """The whole report as a JSON-able document; `kept` holds what was done before.
 
     Raises InputError before anything is run. Interrupted, it reports the rows that are done
     (see `run_all`).
@@ -30,17 +32,19 @@ def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int
     world = worlds.build(scenarios)
     for contender in rows:
         contender.check(world)
-    found = run_all(rows, world)
+    found = run_all(rows, world, kept=kept)
     reference = optima.reference(world.scenarios)
     return document(world.family, found, reference, seed, title, command) | missing(found, rows)
 
 
-def run_all(rows: Sequence[Contender], world: World, least: int = 1) -> list[metrics.Outcomes]:
+def run_all(rows: Sequence[Contender], world: World, least: int = 1,
+            kept: Kept = NOTHING) -> list[metrics.Outcomes]:
     """What each contender did; after Ctrl-C what those before it did, if at least `least`."""
     found = []
     try:
         for contender in rows:
-            found.append(contender.run(world))
+            found.append(contender.run(world, kept))
+            interrupts.hold()
     except KeyboardInterrupt:
         if len(found) < least:
             raise

@@ -13,6 +13,7 @@ from moonteam.evaluation.contenders import Options
 from moonteam.evaluation.timed import Contender, Outcomes
 from moonteam.problem.timed import Timed
 from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure
+from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.tables import duration
 
 FloatArray = npt.NDArray[np.float64]
@@ -42,7 +43,7 @@ def contenders(problems: Sequence[Timed], options: Options) -> list[Contender]:
 
 
 def run_all(sets: Mapping[str, Sequence[Timed]], rows: Mapping[str, Sequence[Contender]],
-            seed: int) -> tuple[list[dict], list[str]]:
+            seed: int, kept: Kept = NOTHING) -> tuple[list[dict], list[str]]:
     """One part a set (summary, rows, notes), and what an interruption left out.
 
     Raises KeyboardInterrupt if nothing was done before it.
@@ -50,7 +51,7 @@ def run_all(sets: Mapping[str, Sequence[Timed]], rows: Mapping[str, Sequence[Con
     parts: list[dict] = []
     for n, (name, problems) in enumerate(sets.items()):
         try:
-            found = timed.run_all(problems, rows[name], name)
+            found = timed.run_all(problems, rows[name], name, kept.within(name))
         except KeyboardInterrupt:
             if not parts:
                 raise

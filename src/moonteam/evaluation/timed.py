@@ -17,9 +17,10 @@ from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.seconds import base, registry
 from moonteam.planners.seconds.base import MS, Moment, TimedPlan, TimedPlanner
 from moonteam.planners.seconds.registry import TimedPlannerKind
-from moonteam.problem.timed import Agent, Target, Timed
+from moonteam.problem.timed import Timed
 from moonteam.report import provenance, tables
 from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure
+from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.progress import track
 from moonteam.report.tables import Column
 
@@ -33,10 +34,6 @@ COLUMNS = (
     Column("certified", "proved optimal", lambda value: f"{value:.3f}"),
     *tables.SECONDS)
 PAGE = COLUMNS
-
-WARM = Timed("seconds", (Agent((0.0, 0.0), ("A",)), Agent((1.0, 0.0), ("B",), 2.0, (0.0, 0.0))), (
-    Target((3.0, 0.0), ("A", "B"), service=1.0), Target((0.0, 3.0), ("A",), after=(0,))))
-"""A problem that takes no time, for what is loaded or compiled at the first call."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ class Contender:
             for problem in {(len(p.agents), len(p.targets)): p for p in problems}.values():
                 self.planner.plan(base.moment(problem))
         else:
-            self.planner.plan(base.moment(WARM))
+            self.planner.plan(base.moment(base.TRIAL))
         return time.perf_counter() - began
 
 
@@ -180,19 +177,25 @@ def check(problems: Sequence[Timed], rows: Sequence[Contender]) -> None:
                              f"{largest.id or 'a problem'} has {len(largest.targets)}")
 
 
-def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = ""
-            ) -> list[Outcomes]:
+def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = "",
+            kept: Kept = NOTHING) -> list[Outcomes]:
     """What each contender did; after Ctrl-C what was done before it, if that is anything."""
     found: list[Outcomes] = []
     try:
         for row in rows:
-            done = Outcomes(row.name, row.warm(problems))
+            own = kept.within(row.name)
+            numbers = range(len(problems))
+            left = not own.has("all") if row.together else any(
+                not own.has(str(i)) for i in numbers)
+            done = Outcomes(row.name, row.warm(problems) if left else 0.0)
             found.append(done)
             if row.together:
-                done.results += row.plan_all(problems)
+                done.results += own.once(
+                    ("all",), list[Result], lambda row=row: row.plan_all(problems))
                 continue
-            for problem in track(problems, f"{title} {row.name}".strip(), len(problems)):
-                done.results.append(row.plan(problem))
+            for i in track(numbers, f"{title} {row.name}".strip(), len(problems)):
+                done.results.append(own.once(
+                    (str(i),), Result, lambda i=i, row=row: row.plan(problems[i])))
     except KeyboardInterrupt:
         found = [done for done in found if done.results]
         if not found:
@@ -201,13 +204,13 @@ def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = "
 
 
 def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, title: str,
-             command: str) -> dict:
+             command: str, kept: Kept = NOTHING) -> dict:
     """The whole report as a JSON-able document; interrupted, it reports what is done.
 
     Raises InputError before anything is run.
     """
     check(problems, rows)
-    found = run_all(problems, rows)
+    found = run_all(problems, rows, kept=kept)
     bootstrap = Bootstrap(len(problems), seed)
     optimal = [best_of(problem) for problem in problems]
     known = sum(one is not None for one in optimal)

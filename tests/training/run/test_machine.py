@@ -16,12 +16,13 @@ import pytest
 from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.grid import env
-from tests.training.killed import kill_when_saved
+from moonteam.interrupts import Stop, postponed
+from tests.killed import kill_when_saved
 from training.mappo import update
 from training.mappo.config import BOOTSTRAP, REFINEMENT, Config, Phase
 from training.mappo.trainee import Mappo
 from training.run import checkpoints, machine, metrics
-from training.run.machine import Run, Stop, stop_on_signals
+from training.run.machine import Run
 
 TINY = Config(
     "small", Phase(4, 8, 2, BOOTSTRAP), Phase(6, 8, 2, REFINEMENT), num_agents=2, num_targets=2,
@@ -163,7 +164,7 @@ def test_sigterm_while_training_saves_and_the_run_goes_on_from_there(tmp_path):
 def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     for number in (signal.SIGTERM, signal.SIGINT):
-        with stop_on_signals() as stop:
+        with postponed() as stop:
             assert not stop.asked
             os.kill(os.getpid(), number)
             assert stop.asked

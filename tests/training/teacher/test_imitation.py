@@ -9,16 +9,17 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
+from moonteam.interrupts import Stop
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
 from moonteam.planners.learned import LearnedPlanner
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.policy_file import load_policy
 from moonteam.problem.scenario import Agent, Scenario, Target
-from tests.training.killed import kill_when_saved
+from tests.killed import kill_when_saved
 from training.commands import imitate
 from training.run import checkpoints, metrics
-from training.run.machine import Diverged, Run, Stop
+from training.run.machine import Diverged, Run
 from training.teacher import pupil
 from training.teacher.families import TIE_BREAK, Family, begin
 from training.teacher.imitation import Dagger, Imitation, label, unlabelled
@@ -118,7 +119,7 @@ def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     words = ["train", "imitate", "quick", "--checkpoint-seconds", "0", "--out"]
     assert main([*words, str(whole)]) == 0
-    kill_when_saved(parts, [*words, str(parts)], SMALLER)
+    kill_when_saved(parts, [*words, str(parts)], SMALLER, kills=3)
     assert main([*words, str(parts), "--resume", "--tensorboard"]) == 0
     before, after = (load_policy(out / "policy.safetensors").params for out in (whole, parts))
     for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):

@@ -8,13 +8,14 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
+from moonteam.interrupts import Stop
 from moonteam.policies import entity
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.policy_file import PolicyFile, load_policy, save_policy
-from tests.training.killed import kill_when_saved
+from tests.killed import kill_when_saved
 from training.commands import refine
 from training.run import metrics
-from training.run.machine import Run, Stop
+from training.run.machine import Run
 from training.teacher import presets, pupil
 from training.teacher.families import TIE_BREAK, Family
 from training.teacher.imitation import Imitation
@@ -108,7 +109,7 @@ def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch):
     words = ["train", "refine", str(begun), "--families", "quick", "--rounds", "5",
              "--checkpoint-seconds", "0", "--out"]
     assert main([*words, str(whole)]) == 0
-    kill_when_saved(parts, [*words, str(parts)], SMALLER)
+    kill_when_saved(parts, [*words, str(parts)], SMALLER, kills=3)
     assert main([*words, str(parts), "--resume", "--beside", str(whole)]) == 0
     before, after = (load_policy(out / "policy.safetensors").params for out in (whole, parts))
     for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):

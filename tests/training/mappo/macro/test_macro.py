@@ -16,7 +16,7 @@ from moonteam.planners.seconds.exhaustive import ExhaustivePlanner
 from moonteam.policies.pointer import PointerSpec, look, point
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import load_policy
-from tests.training.killed import kill_when_saved
+from tests.killed import kill_when_saved
 from training.mappo.macro import grounds
 from training.mappo.macro.config import PRESETS, MacroConfig, Practice
 from training.mappo.macro.held_out import HeldOut, moment_of
@@ -201,7 +201,7 @@ def test_killed_and_resumed_is_bit_identical(tmp_path, monkeypatch, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     words = ["train", "quick", "--checkpoint-seconds", "0", "--out"]
     assert main([*words, str(whole)]) == 0
-    kill_when_saved(parts, [*words, str(parts)], SMALLER)
+    kill_when_saved(parts, [*words, str(parts)], SMALLER, kills=3)
     assert main([*words, str(parts), "--resume"]) == 0
     before, after = (load_policy(out / "policy.safetensors").params for out in (whole, parts))
     for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):

@@ -1,45 +1,56 @@
-"""A run over many missions that can be interrupted: its folder and its options."""
+"""A run over many rows that can be interrupted or killed: its folder and its options."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from moonteam import files, outputs
+from moonteam import files, interrupts, outputs
 from moonteam.errors import InputError
 from moonteam.report.command import flag
 from moonteam.version import __version__
 
+NEEDS_OUT = "needs the folder of the run to go on with: --out DIR"
 Entry = TypeVar("Entry")
+T = TypeVar("T")
 
 
 class Journal(Generic[Entry]):
-    """The folder's rows.jsonl: a line is added as each mission ends.
+    """The folder's rows.jsonl: a line is added as each row is done.
 
     `entries` is what was done before; empty unless the run is resumed.
     """
 
     def __init__(self, out: Path, resume: bool, options: dict[str, Any], kind: Any,
-                 names: Sequence[str] = ()):
+                 names: Sequence[str] = (), wait: bool = False):
         """Starts the folder, or reads what is done if it is to be resumed.
 
         `kind` is the type of an entry, `names` what an earlier run left, to be removed unless it is
-        resumed. Raises InputError.
+        resumed; with `wait` nothing is removed or written until `begin`. Raises InputError.
         """
-        self._path, config = out / "rows.jsonl", out / "config.json"
+        self._path, self._config, self._begun = out / "rows.jsonl", out / "config.json", False
         self.entries: list[Entry] = []
-        held = {"moonteam": __version__, "options": options}
+        self._held = {"moonteam": __version__, "options": options}
         if resume:
-            _check_same(out, config, msgspec.json.decode(files.dump_json(held)))
+            _check_same(out, self._config, msgspec.json.decode(files.dump_json(self._held)))
             self.entries = self._read(kind)
-        else:
-            outputs.clear(out, names)
-        files.write_json(config, held)
-        files.write_text(self._path, "".join(map(_line, self.entries)))
+        self._old = None if resume else (out, names)
+        if not wait:
+            self.begin()
+
+    def begin(self) -> None:
+        """Writes the options, and the entries without the half of a line; once."""
+        if not self._begun:
+            if self._old is not None:
+                outputs.clear(*self._old)
+            files.write_json(self._config, self._held)
+            files.write_text(self._path, "".join(map(_line, self.entries)))
+            self._begun = True
 
     def add(self, entry: Entry) -> None:
         """Adds an entry; what an interruption cuts off is dropped when the run is resumed."""
@@ -56,6 +67,55 @@ class Journal(Generic[Entry]):
             except msgspec.DecodeError as error:
                 raise InputError(self._path, f"line {number} is no row: {error}") from None
         return found
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Results by name, each made once: in a journal where there is a folder, else only made."""
+
+    journal: Journal[tuple[tuple[str, ...], Any]] | None = None
+    known: dict[tuple[str, ...], Any] = field(default_factory=dict)
+    prefix: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, out: Path | None, resume: bool, options: dict[str, Any],
+           names: Sequence[str] = ()) -> Kept:
+        """Results of a command with these options and files. Raises InputError, see `Journal`."""
+        if out is None:
+            if resume:
+                raise InputError("--resume", NEEDS_OUT)
+            return cls()
+        entry = tuple[tuple[str, ...], Any]
+        journal = Journal[entry](out, resume, options, entry, names, wait=True)
+        return cls(journal, dict(journal.entries))
+
+    def within(self, *names: str) -> Kept:
+        """The same journal, its names behind these."""
+        return Kept(self.journal, self.known, (*self.prefix, *names))
+
+    def once(self, names: tuple[str, ...], kind: type[T], make: Callable[[], T]) -> T:
+        """What was made under these names before, or what is made and noted now.
+
+        `kind` is what msgspec reads it as. KeyboardInterrupt and InputError pass through.
+        """
+        whole = (*self.prefix, *names)
+        if whole in self.known:
+            return msgspec.convert(self.known[whole], kind)
+        if self.journal is not None:
+            self.journal.begin()
+        made = make()
+        if self.journal is not None:
+            self.journal.add((whole, made))
+        interrupts.hold()
+        return made
+
+    def has(self, *names: str) -> bool:
+        """Whether it was made before."""
+        return (*self.prefix, *names) in self.known
+
+
+NOTHING = Kept()
+"""Where nothing is kept."""
 
 
 def _line(entry: object) -> str:
@@ -89,11 +149,11 @@ def check(args: Any, ranges: Sequence[tuple[str, float, float]],
         if len(set(chosen)) < len(chosen) or not chosen:
             raise InputError(flag(name), "give each once, and at least one")
     if args.resume and args.out is None:
-        raise InputError("--resume", "needs the folder of the run to go on with: --out DIR")
+        raise InputError("--resume", NEEDS_OUT)
 
 
 def interrupted(out: Path | None) -> int:
     """Says that the run was stopped and how to go on; returns the exit code."""
     more = ": --resume goes on" if out else ""
     print(f"moonteam: interrupted{more}", file=sys.stderr)
-    return 130
+    return interrupts.CODE

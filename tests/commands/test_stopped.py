@@ -1,0 +1,135 @@
+"""Commands that are interrupted or killed, each in a process of its own."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from tests.killed import kill_once
+
+CHILD = {"JAX_PLATFORMS": "cpu"}
+BUSY = 8.0
+"""s more than the second in which a signal is answered, for a machine that has other work."""
+
+
+def rows(out):
+    path = out / "rows.jsonl"
+    return path.read_text().count("\n") if path.exists() else 0
+
+
+class Child:
+    """`moonteam WORDS`, and what it says on standard error as it says it."""
+
+    def __init__(self, words):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "moonteam.cli", *words], env=os.environ | CHILD,
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        self.said, self.when = b"", []
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self):
+        while part := os.read(self.process.stderr.fileno(), 4096):
+            self.said += part
+            self.when.append(time.monotonic())
+
+    def answer(self, number, ready, delay):
+        """Sends a signal `delay` s after `ready()`; (s to its answer, exit code, what it said)."""
+        deadline = time.monotonic() + 600
+        while not ready():
+            assert self.process.poll() is None, self.said.decode()
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(delay)
+        assert self.process.poll() is None, "ended before the signal"
+        sent = time.monotonic()
+        self.process.send_signal(number)
+        code = self.process.wait(600)
+        ended = time.monotonic()
+        self._reader.join()
+        answered = min([ended, *(when for when in self.when if when >= sent)])
+        return answered - sent, code, self.said.decode()
+
+
+def check(words, ready=lambda: True, delay=0.0, number=signal.SIGINT):
+    """The signal is answered within a second, with one or two lines and the exit code 130."""
+    took, code, said = Child(words).answer(number, ready, delay)
+    assert took < 1.0 + BUSY
+    assert code == 130, said
+    assert "Traceback" not in said
+    assert "interrupted" in said
+    return said
+
+
+NUMBERS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+
+
+@NUMBERS
+def test_a_search_is_left(number):
+    words = ["plan", "8x40:0", "--planner", "lns", "--time-limit", "60"]
+    check(words, delay=3.0, number=number)
+
+
+@NUMBERS
+def test_rows_are_saved_and_gone_on_with(tmp_path, number):
+    words = ["evaluate", "grid", "8x40", "--planner", "lns", "--time-limit", "0.3", "--limit", "40",
+             "--out", str(tmp_path)]
+    check(words, lambda: rows(tmp_path) >= 2, number=number)
+    done = rows(tmp_path)
+    said = check([*words, "--resume"], lambda: rows(tmp_path) >= done + 2, number=number)
+    assert "--resume goes on" not in said  # nothing is reported of a planner that is half done
+    assert rows(tmp_path) >= done + 2
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("delay", [2.0, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize("words", [
+    ("train", "quick"), ("train", "small"), ("train", "imitate", "quick"),
+    ("train", "refine", "any_team_imitated", "--families", "quick"),
+    ("evaluate", "execution", "--count", "40"), ("evaluate", "sets"), ("evaluate", "peers"),
+    ("rollout", "outpost", "--backend", "native"), ("rollout", "demo"), ("bench", "grid"),
+    ("site", "--preset", "mare"), ("testsets", "import", "--format", "dcmrta")], ids=" ".join)
+def test_wherever_it_is(tmp_path, words, delay):
+    """Importing, making grounds, compiling, at work: after so many seconds, each somewhere."""
+    child = Child([*words, "--out", str(tmp_path / "out")])
+    time.sleep(delay)
+    if child.process.poll() is not None:
+        pytest.skip("is done by then")
+    took, code, said = child.answer(signal.SIGINT, lambda: True, 0.0)
+    assert took < 1.0 + BUSY
+    assert code == 130, said
+    assert "Traceback" not in said
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("mode", ["barrier", "clock"])
+def test_an_evaluation_in_physics_survives_kills(tmp_path, mode):
+    """Killed at random moments and gone on with, the same rows to the bit, each once."""
+    words = ["evaluate", "execution", "--site", "flat", "--planner", "exact", "--side", "8",
+             "--targets", "2", "--count", "12", "--width", "3", "--mode", mode, "--out"]
+    chance, whole, parts, kills = random.Random(1), tmp_path / "whole", tmp_path / "parts", 0
+    environment = os.environ | CHILD
+    run = [sys.executable, "-m", "moonteam.cli", *words]
+    assert subprocess.run([*run, str(whole)], env=environment, stdout=subprocess.DEVNULL,
+                          check=False).returncode == 0
+    more: list[str] = []
+    while kills < 5 and rows(parts) < 12:
+        old = rows(parts)
+        kills += kill_once([*words, str(parts), *more],
+                           lambda old=old: rows(parts) > old, 0.3 * chance.random())
+        more = ["--resume"]
+    assert subprocess.run([*run, str(parts), "--resume"], env=environment,
+                          stdout=subprocess.DEVNULL, check=False).returncode == 0
+    print(f"{kills} kills survived")
+    assert kills >= 2
+    found = [json.loads((folder / "report.json").read_text()) for folder in (whole, parts)]
+    assert found[0]["rows"] == found[1]["rows"]
+    assert found[0]["summary"] == found[1]["summary"]
+    lines = [sorted((folder / "rows.jsonl").read_text().splitlines()) for folder in (whole, parts)]
+    assert lines[0] == lines[1]

@@ -1,0 +1,103 @@
+"""Signals while Python code runs, and while a compiled program does that knows nothing of them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+BUSY = 8.0
+"""s more than promised, for a machine that has other work."""
+BEGIN = """
+import hashlib, sys
+from moonteam import interrupts
+
+def compiled(rounds):
+    "Without the lock of Python, and without a look at signals."
+    hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
+
+def main():
+    print("ready", flush=True)
+    try:
+        work()
+    except KeyboardInterrupt:
+        print("saved", flush=True)
+        return interrupts.say()
+
+def started():
+    with interrupts.handled():
+        return main()
+"""
+ENDLESS = 1 << 31
+NUMBERS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+
+
+def run(work, *signals, ignored=()):
+    """(code, standard output, standard error, s from the last signal to the end) of some work."""
+    def ignore():
+        for number in ignored:
+            signal.signal(number, signal.SIG_IGN)
+
+    child = subprocess.Popen(
+        [sys.executable, "-c", f"{BEGIN}\ndef work():\n    {work}\nsys.exit(started())"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=ignore)
+    assert child.stdout.readline() == b"ready\n"
+    said = b""
+    for number in signals:
+        time.sleep(0.2)
+        sent = time.monotonic()
+        child.send_signal(number)
+        if len(signals) > 1 and not said:  # the first is answered with a line
+            said = os.read(child.stderr.fileno(), 4096)
+            assert time.monotonic() - sent < 1.0 + BUSY
+    out, err = child.communicate(timeout=120)
+    return child.returncode, out.decode(), (said + err).decode(), time.monotonic() - sent
+
+
+@NUMBERS
+def test_python_code_is_left_at_once(number):
+    code, out, err, seconds = run("import time; time.sleep(100)", number)
+    assert (code, out, err) == (130, "saved\n", "moonteam: interrupted\n")
+    assert seconds < 1.0 + BUSY
+
+
+@NUMBERS
+def test_where_nothing_is_done_a_compiled_program_is_not_waited_for(number):
+    code, out, err, seconds = run(f"compiled({ENDLESS - 1})", number)
+    assert (code, out, err) == (130, "", "moonteam: interrupted\n")
+    assert seconds < 1.0 + BUSY
+
+
+@NUMBERS
+def test_where_something_is_done_a_line_comes_at_once_and_the_program_is_waited_for(number):
+    code, out, err, _ = run("interrupts.hold(); compiled(3_000_000)", number)
+    assert (code, out) == (130, "saved\n")
+    assert err.startswith("moonteam: stopping; what runs is finished and saved, a second Ctrl-C ")
+    assert err.endswith("moonteam: interrupted\n")
+
+
+def test_a_second_signal_leaves_at_once():
+    code, out, err, seconds = run(f"interrupts.hold(); compiled({ENDLESS - 1})", signal.SIGINT,
+                                  signal.SIGINT)
+    assert (code, out) == (130, "")
+    assert "stopping" in err
+    assert seconds < 1.0 + BUSY
+
+
+def test_between_two_pieces_the_first_signal_only_asks():
+    work = """
+    interrupts.hold()
+    with interrupts.postponed() as stop:
+        while not stop.asked:
+            compiled(200_000)
+    print("finished", flush=True)"""
+    code, out, err, _ = run(work.strip(), signal.SIGTERM)
+    assert (code, out) == (0, "finished\n")
+    assert "stopping" in err
+
+
+def test_what_was_ignored_at_the_start_is_ignored():
+    code, out, _, _ = run("import time; time.sleep(2)", signal.SIGINT, ignored=[signal.SIGINT])
+    assert (code, out) == (0, "")
