@@ -78,7 +78,8 @@ class Run:
 
     def _find(self, resume: bool, force: bool) -> Position:
         self._check_folder(resume, force)
-        found = None if force else checkpoints.load(self.folder)
+        found = None if force else checkpoints.load(
+            self.folder, lambda about: self._expected(about, self.folder))
         if found is None:
             return Position(self.trainee.phases[0][0])
         return self._restored(*found, self.folder)
@@ -87,7 +88,8 @@ class Run:
         if resume:
             raise InputError("--begin", "is for a new run; --resume alone goes on with one")
         self._check_folder(resume, force)
-        return self._restored(*checkpoints.read(begin), begin)
+        return self._restored(
+            *checkpoints.read(begin, lambda about: self._expected(about, begin)), begin)
 
     def _check_folder(self, resume: bool, force: bool) -> None:
         """Raises InputError if the folder holds a run, and not one to be resumed as it is."""
@@ -110,18 +112,26 @@ class Run:
                                  f"them ({before.get(odd[0])!r}, now {plain.get(odd[0])!r})",
                                  odd[0])
 
-    def _restored(self, about: About, arrays: dict[str, np.ndarray], source: Path) -> Position:
-        """Where a checkpoint stands, its arrays with the trainee.
+    def _expected(self, about: About, source: Path) -> Any:
+        """The state that a checkpoint must hold, in shapes.
 
         Raises InputError if this run never comes there.
         """
         trainee = self.trainee
         if about.network != msgspec.json.decode(files.dump_json(trainee.network)):
             raise InputError(source, "is of another network")
-        made = dict(trainee.phases).get(about.phase, 0)
+        made = dict(trainee.phases).get(about.phase)
+        if made is None:
+            raise InputError(source, f"stands in {about.phase!r}; this run has "
+                             + ", ".join(phase for phase, _ in trainee.phases))
         if about.update > made:
             raise InputError(source, f"stands after {about.update} {trainee.unit}s of "
                              f"{about.phase}; this run makes {made}", f"{about.phase}.updates")
+        return trainee.shapes(about.phase)
+
+    def _restored(self, about: About, arrays: dict[str, np.ndarray], source: Path) -> Position:
+        """Where a checkpoint stands, its arrays with the trainee."""
+        trainee = self.trainee
         state = checkpoints.unflatten(arrays, trainee.shapes(about.phase), source)
         trainee.restore(about.phase, state)
         return Position(about.phase, about.update, about.total_updates, about.env_steps,
