@@ -85,8 +85,11 @@ def window(path: Named, *, band: int = 0, scale: float | None = None,
 def _array(path: Named, pixel_m: float | None, extent_m: Any, centre_m: tuple[float, float],
            scale: float) -> Window:
     try:
-        heights = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError):
+        with Path(path).open("rb") as file:
+            np.lib.format.read_magic(file)  # an archive of arrays begins otherwise
+        with np.errstate(all="ignore"):
+            heights = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception:  # of the header, which is Python's own grammar: anything at all
         raise InputError(path, "is not a NumPy array file") from None
     if heights.ndim != 2 or heights.dtype.kind not in "fiu":
         raise InputError(path, f"holds {heights.dtype} of shape {heights.shape}; "
