@@ -25,6 +25,7 @@ from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem import timed
 from moonteam.problem.importers.base import Importer, entry, folders, places, read_yaml, skill
+from moonteam.problem.scenario import MOST_AGENTS, MOST_TARGETS
 from moonteam.problem.timed import Agent, Known, Target, Timed
 from moonteam.report.progress import track
 
@@ -66,6 +67,10 @@ def _instance(folder: Path, published: dict[str, float]) -> Timed:
     teams = entry(said, plan, "vehNumPerType", kind=list[int])
     if len(teams) != 1:
         raise InputError(plan, f"{len(teams)} types of robot; this format has one", "vehNumPerType")
+    for key, number, most in (("taskNum", count, MOST_TARGETS),
+                              ("vehNumPerType", teams[0], MOST_AGENTS)):
+        if not 1 <= number <= most:
+            raise InputError(plan, f"{number} is not allowed; 1 to {most}", key)
     ways = read_yaml(graph)
     distances, speed = _distances(ways, graph, count)
     at = places(distances, graph)
