@@ -36,9 +36,11 @@ class Args(Printed):
     Examples:
       moonteam doctor
       moonteam doctor --json
+      moonteam doctor --licences
     """
 
-
+    licences: bool = False
+    """Say instead what moonteam needs to run: name, version and licence of every package."""
 
 def versions() -> dict[str, str | None]:
     """Installed version of each package that matters; None where it is missing."""
@@ -87,6 +89,8 @@ def examine() -> dict:
 
 def run(args: Args) -> int:
     """Prints the findings; always 0, since missing extras are no failure."""
+    if args.licences:
+        return _print_licences(args.json)
     found = examine()
     if args.json:
         print(files.dump_json(found))
@@ -108,4 +112,17 @@ def run(args: Args) -> int:
     table.add_row("video", f"ffmpeg {found['ffmpeg']}" if found["ffmpeg"] else "no ffmpeg found")
     table.add_row("cache", found["cache"])
     Console().print(table)
+    return 0
+
+
+def _print_licences(as_json: bool) -> int:
+    from moonteam.report import licences
+
+    found = licences.packages()
+    if as_json:
+        print(files.dump_json([one._asdict() for one in found]))
+        return 0
+    wide = max(len(f"{one.name} {one.version}") for one in found)
+    for one in found:
+        print(f"{one.name} {one.version}".ljust(wide), one.licence)
     return 0
