@@ -15,10 +15,17 @@ from moonteam.errors import InputError
 FAR = 1.0e9
 """Stands for minus infinity in masked logits, without its not-a-number."""
 
+MOST_WIDE = 4096
+MOST_LAYERS = 32
 
-def check_sizes(source: object, width: int, heads: int, *others: int) -> None:
-    """Raises InputError if the numbers make no network."""
-    if min(width, heads, *others) < 1 or width % heads:
+
+def check_sizes(source: object, width: int, heads: int, layers: int, pairs: int = 1) -> None:
+    """Raises InputError if the numbers make no network, or too large a one."""
+    for name, number, most in (("width", width, MOST_WIDE), ("heads", heads, MOST_WIDE),
+                               ("layers", layers, MOST_LAYERS), ("pairs", pairs, MOST_WIDE)):
+        if not 1 <= number <= most:
+            raise InputError(source, f"{name} ({number}) is not allowed; 1 to {most}")
+    if width % heads:
         raise InputError(source, f"heads ({heads}) must divide width ({width})")
 
 

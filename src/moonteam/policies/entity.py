@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax import Array
 
+from moonteam.errors import InputError
 from moonteam.grid.env import available
 from moonteam.grid.travel import distances, first_step
 from moonteam.grid.types import Problem, State
@@ -48,6 +49,8 @@ class EntitySpec:
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no network."""
         attention.check_sizes(source, self.width, self.heads, self.layers)
+        if not 0 <= self.free <= 1:
+            raise InputError(source, f"free ({self.free}) is a share, 0 to 1")
 
 
 @jax.tree_util.register_dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -50,8 +50,7 @@ class Policy:
             raise InputError(path, f"its header describes no {stored.kind} network: "
                              f"{error}") from None
         spec.check(path)
-        wanted = jax.eval_shape(partial(init, spec), jax.random.key(0))
-        policy_file.check_shapes(path, stored.params, wanted)
+        policy_file.check_shapes(path, stored.params, _shapes(init, spec))
         params = jax.tree.map(jnp.asarray, stored.params)
         return cls(brain_type(spec), params, stored, str(path))
 
@@ -60,3 +59,9 @@ class Policy:
         problem = self.brain.misfit(mission)
         if problem:
             raise InputError(self.path, problem)
+
+
+@lru_cache(64)
+def _shapes(init: Any, spec: Any) -> Any:
+    """Of a network's parameters."""
+    return jax.eval_shape(partial(init, spec), jax.random.key(0))

@@ -9,6 +9,7 @@ D observation length, H width.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +20,9 @@ from flax import linen as nn
 from jax import Array
 
 from moonteam.errors import InputError
+from moonteam.policies.attention import MOST_WIDE
 from moonteam.problem.rules import NUM_ACTIONS
+from moonteam.problem.scenario import MAX_SKILLS, MOST_AGENTS, MOST_SIDE, MOST_TARGETS
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,9 @@ class RecurrentSpec:
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no policy."""
         counts = (self.num_agents, self.num_targets, self.num_skills, self.width, *self.size)
-        if min(counts) < 1 or len(self.size) != 2:
-            raise InputError(source, f"not the numbers of a policy: {self}")
+        most = (MOST_AGENTS, MOST_TARGETS, MAX_SKILLS, MOST_WIDE, MOST_SIDE, MOST_SIDE)
+        if min(counts) < 1 or len(self.size) != 2 or any(map(operator.gt, counts, most)):
+            raise InputError(source, f"not the numbers of a policy: {self}; at most {most}")
 
 
 class Gru(nn.Module):
