@@ -194,6 +194,18 @@ def test_evaluate_peers_holds_ours_against_every_published_column(capsys, tmp_pa
     assert len((tmp_path / "rows.csv").read_text().splitlines()) == 1 + 2 * (5 + 2 + 2)
 
 
+def test_one_optimum_of_two_hundred_is_none(capsys):
+    """What is published for 1p_000080 takes 15 units longer than the exact planner's proof."""
+    with_limit = ("--limit", "81", "--planner", "exact", "--json")
+    code, document = output(capsys, "evaluate", "peers", "optima/mrta-benchmark", *with_limit)
+    assert code == 0
+    row, = document["sets"][0]["against"]
+    assert (row["shorter"], row["equal"], row["longer"]) == (1, 80, 0)
+    last = document["rows"][80]
+    assert (last["id"], last["published"]) == ("1p_000080", {"MILP": 653.82295})
+    assert last["makespan"] == {"exact": 638.741}
+
+
 def test_an_interrupted_comparison_is_saved(capsys, tmp_path, monkeypatch):
     row, = rows("Quitter")
     monkeypatch.setattr(type(row.planner), "left", 3)
@@ -219,6 +231,9 @@ def test_an_interrupted_comparison_is_saved(capsys, tmp_path, monkeypatch):
     (["peers", "--planner", "best"], "no such planner by the clock"),
     (["grid", SET, "--planner", "best"], "no such planner by the clock"),
     (["grid", SET, "--policy", "any_team"], "--policy: has no effect"),
+    (["grid", SET, "--threads", "2"], "--threads: has no effect without a planner that takes"),
+    (["grid", SET, "--planner", "lns", "--threads", "0"], "--threads: 0 is not allowed"),
+    (["grid", "3x5", "--planner", "lns", "--threads", "2"], "--threads: is for sets by the clock"),
     (["replanning", SET, "--planner", "greedy"], "is by the clock"),
 ])
 def test_what_cannot_be_is_one_line(capsys, words, said):

@@ -75,6 +75,8 @@ class Args(Drawn, Limited, Resumable, Reported):
     time_limit: Many[tuple[float, ...]] = ()
     """Seconds a scenario that anytime planners (exact, lns, cpsat) may take; again for
     more rows. Default: theirs."""
+    threads: int = 1
+    """That lns by the clock searches with side by side."""
 
 
 def load_any(name: str, limit: int | None) -> list[Scenario] | list[Timed]:
@@ -119,7 +121,8 @@ def options_of(args: Any) -> Any:
         policies=[paths.find(p, "policies", ".safetensors") for p in args.policy],
         preferences=getattr(args, "preference", ()), decodes=args.decode or ("argmax",),
         alpha=getattr(args, "alpha", 1.0), beta=getattr(args, "beta", 0.05),
-        time_limits=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False))
+        time_limits=args.time_limit, seed=args.seed, alone=getattr(args, "alone", False),
+        threads=getattr(args, "threads", 1))
 
 
 def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
@@ -164,5 +167,7 @@ def judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: st
     clocked = [one for one in found if isinstance(one, Timed)]
     if clocked:
         return timed.evaluate(clocked, timed.contenders(options), seed, title, line, kept), timed
+    if options.threads > 1:
+        raise InputError("--threads", "is for sets by the clock")
     steps = [one for one in found if isinstance(one, Scenario)]
     return grid.evaluate(steps, contenders.contenders(options), seed, title, line, kept), grid

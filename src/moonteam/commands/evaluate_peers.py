@@ -46,6 +46,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     sets of at most 10 targets, and lns."""
     time_limit: Many[tuple[float, ...]] = ()
     """Seconds a problem that anytime planners may take; again for more. Default: theirs; lns: 1."""
+    threads: int = 1
+    """That lns by the clock searches with side by side."""
     policy: Many[tuple[str, ...]] = ()
     """For --planner policy: policy file (.safetensors) or the name of a bundled policy; again for
     more. Default: any_team."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -16,6 +16,9 @@ from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
 from moonteam.report.progress import busy
+
+if TYPE_CHECKING:
+    from moonteam.planners.kind import PlannerOptions
 
 FILES = ("plan.json", "plan.png")
 """In --out."""
@@ -51,9 +54,15 @@ class Args(Planning, Saved, Printed):
     package's, or FILE.py:OBJECT."""
     seed: int = 0
     """Seed of lns and of a policy that samples."""
+    threads: int = 1
+    """That lns by the clock searches with side by side."""
     clock: Literal["steps", "seconds"] | None = None
     """steps: one cell a decision; seconds: a mission on its ground, at any angle, each kind at its
     own speed. Default: as the file says."""
+
+    def planner_options(self, seed: int = 0) -> PlannerOptions:
+        """With the threads. Raises InputError naming the option at fault."""
+        return replace(super().planner_options(seed), threads=self.threads)
 
 
 @dataclass(frozen=True)
@@ -150,6 +159,8 @@ def run(args: Args) -> int:
         return clocked.run(args, timed.of(found) if isinstance(found, Scenario) else found)
     if isinstance(found, Timed) or (isinstance(found, Mission) and found.clock == "seconds"):
         raise InputError("--clock steps", f"{args.scenario} is by the clock")
+    if args.threads > 1:
+        raise InputError("--threads", "is for plans by the clock (--clock seconds)")
     case = case_of(found)
     with busy("planning; the first time on a machine it compiles for a minute"):
         plan = make_plan(args, Snapshot.start(case.scenario))

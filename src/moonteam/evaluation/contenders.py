@@ -56,12 +56,15 @@ class Options:
     """Seconds a plan that anytime planners may take, one row each; empty: theirs."""
     seed: int = 0
     alone: bool = False
+    threads: int = 1
+    """That a planner by the clock may search with."""
 
     def of(self, objective: Objective | None = None, limit: float | None = None,
            preference: float = 0.0, policy: str | Path | None = None) -> PlannerOptions:
         """What one planner of them is made from. Raises InputError."""
         return PlannerOptions(objective, self.alpha, self.beta, limit, self.seed,
-                              policy or DEFAULT_POLICY, preference=preference)
+                              policy or DEFAULT_POLICY, preference=preference,
+                              threads=self.threads)
 
 
 class Contender(Protocol):

@@ -137,6 +137,8 @@ def contenders(options: Options) -> list[Contender]:
 
 def _check_options(options: Options, kinds: Sequence[TimedPlannerKind]) -> None:
     """Raises InputError for options that would have no effect."""
+    if options.threads > 1 and not any(kind.parallel for kind in kinds):
+        raise InputError("--threads", "has no effect without a planner that takes them: lns")
     if any(kind.wants_policy for kind in kinds):
         return
     for option, given in (("--policy", options.policies), ("--preference", options.preferences),
@@ -154,6 +156,7 @@ def _planned(kind: TimedPlannerKind, options: Options, objectives: Sequence[Obje
     for objective, limit in itertools.product(objectives, limits or [None]):
         words = ["effort" if objective == "moves" else objective]
         words += [f"{limit:g} s"] if len(limits) > 1 else []
+        words += [f"{options.threads} threads"] if options.threads > 1 and kind.parallel else []
         found.append(Contender(f"{kind.name}({', '.join(words)})", kind.make(
             options.of(objective, limit)), kind.most_targets))
     return found

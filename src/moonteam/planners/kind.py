@@ -43,6 +43,8 @@ class PlannerOptions:
     """How actions are read from a policy, see `decode.ALLOWED`."""
     preference: float = 0.0
     """0 (time) to 1 (effort), for policies that were trained with it."""
+    threads: int = 1
+    """That a planner may search with side by side, if it can."""
 
     def __post_init__(self) -> None:
         if self.objective is not None:
@@ -52,6 +54,8 @@ class PlannerOptions:
             raise InputError("--time-limit", f"{limit} is not allowed; seconds above 0")
         if self.seed < 0:
             raise InputError("--seed", f"{self.seed} is not allowed; at least 0")
+        if self.threads < 1:
+            raise InputError("--threads", f"{self.threads} is not allowed; at least 1")
         if not 0.0 <= self.preference <= 1.0:
             raise InputError("--preference",
                              f"{self.preference} is not allowed; 0 (time) to 1 (effort)")

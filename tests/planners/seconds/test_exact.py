@@ -68,14 +68,14 @@ def test_the_plain_case_is_solved_the_same_either_way(instances, monkeypatch):
 
 
 def test_stopped_early_it_is_feasible_with_a_valid_bound(instances, monkeypatch):
-    monkeypatch.setattr(exact, "_CHUNK", 1)
+    monkeypatch.setattr(exact, "_TRIES", 1)
     seen = set()
     for seed in range(12):
         now = instances.large(seed, 3, 7, skills=2, most=1)
         for objective in instances.OBJECTIVES:
             goal = (objective, 1.0, 0.3)
             best = instances.judged(now, ExactPlanner(*goal).plan(now))
-            early = ExactPlanner(*goal, time_limit=1e-9).plan(now)
+            early = ExactPlanner(*goal, time_limit=(1e-9, 1e-3)[seed % 2]).plan(now)
             seen.add(early.status)
             instances.judged(now, early)
             assert best.status == "optimal"

@@ -4,10 +4,12 @@ import time
 
 import pytest
 
+from moonteam.planners.seconds import local
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.goal import value
+from moonteam.planners.seconds.search.work import compact
 
 
 def test_what_is_found_is_a_plan_and_mostly_the_best_one(instances):
@@ -47,6 +49,32 @@ def test_a_budget_of_iterations_makes_it_repeatable(instances):
     assert one.services == two.services
     other = LocalSearchPlanner(iterations=3000, seed=6).plan(now)
     assert other.services != one.services
+
+
+def test_threads_search_each_for_itself_and_the_best_counts(instances):
+    now = instances.large(4, 8, 24, skills=2, most=2)
+
+    def plan(**options):
+        planner = LocalSearchPlanner(iterations=4000, **options)
+        return instances.judged(now, planner.plan(now)), planner.curve
+
+    alone, (three, curve), (again, _) = plan(seed=5), plan(seed=5, threads=3), plan(
+        seed=5, threads=3)
+    assert three.services == again.services
+    assert three.makespan < alone[0].makespan
+    assert [cost for _, cost in curve] == sorted({cost for _, cost in curve}, reverse=True)
+    assert curve[-1][1] == three.makespan
+
+
+def test_runs_begin_anew_and_the_best_counts(instances, monkeypatch):
+    now = instances.large(5, 6, 20, most=2)
+    opened = compact(now)
+    monkeypatch.setattr(local, "_RUN", 5)
+    several = local.search(opened, 1.0, 0.0, iterations=6000)
+    assert several.iterations == 6000
+    firsts = [local.search(opened, 1.0, 0.0, iterations=2000, seed=k * local._APART).cost
+              for k in range(3)]
+    assert several.cost == min(firsts)
 
 
 @pytest.mark.parametrize("limit", [0.01, 0.1, 1.0])

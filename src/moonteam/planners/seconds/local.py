@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 import time
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,8 +31,9 @@ _BLOCK = 200  # moves between the first looks at the clock
 _SLICE = 0.002  # s between later looks
 _LAST = 4e-5  # s a target that it takes to write the plan down
 _GREEDY = 5e-9  # s that the greedy plan takes, by targets squared and agents
-_AGAIN, _SMALL = 300, 16  # moves a target after which small ones start hot again; up to how many
-_COLD = 0.01  # temperature at the end, in units
+_AGAIN, _SMALL = 300, 16  # moves a target after which small ones are hot again; up to how many
+_RUN = 600  # moves by targets squared of one run, after which another begins anew
+_APART = 7919  # between the seeds of runs
 MIX = np.array([0.6, 0.65, 0.75, 0.95, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.3, 1.0])
 """Chances of the moves, added up, and their measures, see `annealing.anneal`; found by trying."""
 
@@ -45,7 +48,8 @@ class Best:
     team: Int64  # [M, P]
     size: Int64  # [M]
     iterations: int
-    curve: list[tuple[float, float]]
+    curve: list[tuple[float, float]]  # seconds since the beginning, cost from then on
+    seconds: float
 
     def lists(self) -> tuple[list[int], list[list[int]]]:
         """Targets and teams as `goal.schedule` takes them."""
@@ -74,13 +78,14 @@ def steering(work: Work, alpha: float, beta: float) -> tuple[annealing.Goal, flo
 
     The latest end alone is a plateau with steps: the fourth mean of all agents' ends leans the
     search towards plans whose other agents end early too, and effort towards short ways. Their
-    weights were found by trying (DCMRTA's instances).
+    weights were found by trying (DCMRTA's and HeteroMRTA's instances).
     """
     legs = work.between[work.between < NEVER]
     agents = len(work.free)
     unit = float(legs.mean() if legs.size else 0.0) + float(work.service.mean()) + 1.0
-    by_way = alpha * min(0.3, 2.0 / agents) / max(float(work.effort.mean()), 1e-9)
-    goal = annealing.Goal(alpha, beta + by_way, 0.5 * alpha, 100.0 * (alpha + beta))
+    by_way = min(0.3, 2.0 / agents, max(0.1, 1.4 / agents))
+    by_way *= alpha / max(float(work.effort.mean()), 1e-9)
+    goal = annealing.Goal(alpha, beta + by_way, 0.4 * alpha, 100.0 * (alpha + beta))
     return goal, unit * (alpha + beta * float(work.effort.mean()))
 
 
@@ -111,9 +116,73 @@ def first_plan(opened: Open, plan: annealing.Plan, space: annealing.Scratch,
     return float(space.result[0])
 
 
+def temperatures(count: int) -> tuple[float, float]:
+    """In units, at the beginning and at the end; found by trying (DCMRTA and HeteroMRTA)."""
+    if count <= _SMALL:
+        return min(100.0 / max(count, 1) ** 2, 0.3), 0.01
+    hot = min(2.0 / count, 100.0 / count**2)
+    return hot, min(max(0.01, 25.0 / count**2), 0.5 * hot)
+
+
 def search(opened: Open, alpha: float, beta: float, iterations: int | None = None,
-           until: float = math.inf, seed: int = 0) -> Best:
-    """The best list found in so many moves, or until `time.perf_counter()` says so."""
+           until: float = math.inf, seed: int = 0, threads: int = 1) -> Best:
+    """The best list found in so many moves, or until `time.perf_counter()` says so.
+
+    Each of the threads makes its own moves, so many or for so long, and the best of all counts.
+    """
+    stop = threading.Event()
+
+    def one(number: int) -> Best:
+        return _runs(opened, alpha, beta, iterations, until, seed + number * _APART**2, stop)
+
+    if threads == 1:
+        return one(0)
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            found = list(pool.map(one, range(threads)))
+        finally:
+            stop.set()  # Ctrl-C does not wait for them
+    return _merge(found, together=True)
+
+
+def _runs(opened: Open, alpha: float, beta: float, iterations: int | None, until: float, seed: int,
+          stop: threading.Event) -> Best:
+    """Runs one after the other, each from the beginning, as long as there is time."""
+    count = len(opened.targets)
+    most = _RUN * count**2 if count > _SMALL else None
+    found: list[Best] = []
+    done = 0
+    while True:
+        left = None if iterations is None else iterations - done
+        moves = left if most is None else most if left is None else min(most, left)
+        found.append(_run(opened, alpha, beta, moves, until, seed + _APART * len(found), stop))
+        done += found[-1].iterations
+        if (count == 0 or stop.is_set() or time.perf_counter() >= until
+                or (iterations is None and most is None)
+                or (iterations is not None and done >= iterations)):
+            return _merge(found)
+
+
+def _merge(found: list[Best], together: bool = False) -> Best:
+    """The best of several, with the moves and the curve of all, made one after the other or not."""
+    best = min(found, key=lambda one: (one.late, one.cost))
+    points: list[tuple[float, float]] = []
+    since = 0.0
+    for one in found:
+        points += [(since + at, cost) for at, cost in one.curve]
+        since += 0.0 if together else one.seconds
+    curve: list[tuple[float, float]] = []
+    for at, cost in sorted(points):
+        if not curve or cost < curve[-1][1]:
+            curve.append((at, cost))
+    seconds = max(one.seconds for one in found) if together else since
+    return replace(best, iterations=sum(one.iterations for one in found), curve=curve,
+                   seconds=seconds)
+
+
+def _run(opened: Open, alpha: float, beta: float, iterations: int | None, until: float, seed: int,
+         stop: threading.Event) -> Best:
+    """One run, cooled down over its moves or its time."""
     began = time.perf_counter()
     work = opened.work
     plan, space = space_for(work)
@@ -121,14 +190,13 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
     true = annealing.Goal(alpha, beta, 0.0, goal.fine)
     now = first_plan(opened, plan, space, goal, until)
     result = space.result
-    hot = min(100.0 / max(len(plan.order), 1) ** 2, 0.3)  # the more, the cooler
-    cold = min(_COLD, 0.5 * hot)
+    hot, cold = temperatures(len(plan.order))
     best = np.array([alpha * result[1] + beta * result[2] + true.fine * result[3], *result[1:]])
     order, team, size = plan.order.copy(), plan.team.copy(), plan.size.copy()
     curve = [(time.perf_counter() - began, float(best[0]))]
     done, block, rest = 0, _BLOCK, 0.0
     again = _AGAIN * len(plan.order) if len(plan.order) <= _SMALL else 0
-    while len(order) > 0:
+    while len(order) > 0 and not stop.is_set():
         clock = time.perf_counter()
         share = 0.0 if iterations is None else done / max(iterations, 1)
         if until < math.inf:
@@ -147,10 +215,10 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
         if best[0] < was:
             curve.append((time.perf_counter() - began, float(best[0])))
         spent = time.perf_counter() - clock
-        if iterations is None:
+        if until < math.inf:
             block = int(min(max(step * _SLICE / max(spent, 1e-6), 20), 4 * step + 20))
     cost = alpha * best[1] + beta * best[2]
-    return Best(cost, float(best[3]), order, team, size, done, curve)
+    return Best(cost, float(best[3]), order, team, size, done, curve, time.perf_counter() - began)
 
 
 class LocalSearchPlanner:
@@ -163,17 +231,19 @@ class LocalSearchPlanner:
       time_limit: seconds; None with a budget of iterations, by which alone a plan depends on
         nothing but the seed.
       seed: of the random numbers.
-      iterations: moves tried; None: as many as the time allows.
+      iterations: moves tried by each thread; None: as many as the time allows.
+      threads: that search side by side, each with random numbers of its own.
     """
 
     name = "local"
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
-                 time_limit: float | None = 1.0, seed: int = 0, iterations: int | None = None):
+                 time_limit: float | None = 1.0, seed: int = 0, iterations: int | None = None,
+                 threads: int = 1):
         self.objective: Objective = check(objective, alpha, beta)
         self.alpha, self.beta = alpha, beta
         self.time_limit = None if iterations is not None else time_limit
-        self.iterations, self.seed = iterations, seed
+        self.iterations, self.seed, self.threads = iterations, seed, threads
         self.curve: list[tuple[float, float]] = []
 
     def plan(self, moment: Moment) -> TimedPlan:
@@ -187,7 +257,7 @@ class LocalSearchPlanner:
         alpha, beta = weights(self.objective, self.alpha, self.beta)
         until = math.inf if self.time_limit is None else (
             began + self.time_limit - _LAST * len(opened.targets))
-        best = search(opened, alpha, beta, self.iterations, until, self.seed)
+        best = search(opened, alpha, beta, self.iterations, until, self.seed, self.threads)
         self.curve = best.curve
         services = schedule(opened, *best.lists())
         span = makespan(moment, services)

@@ -3,7 +3,8 @@
 One's own is a class, or a function, that makes an object with `plan(moment) -> TimedPlan`
 (`base.TimedPlanner`), offered as `--planner FILE.py:OBJECT` or by an entry point in the group
 `moonteam.planners.seconds`. It is called with what it has parameters for: `objective`
-(makespan, effort or weighted), `alpha`, `beta`, `time_limit`, `seed`, or all as `options`. A
+(makespan, effort or weighted), `alpha`, `beta`, `time_limit`, `seed`, `threads`, or all as
+`options`. A
 class may say of itself `most_targets`, the open targets that it takes on, and `wants_policy`, that
 it decides by the policy of the options. Ours are imported when they are first asked for.
 """
@@ -46,6 +47,11 @@ class TimedPlannerKind:
         return "time_limit" in takes or ("options" in takes and not self.wants_policy)
 
     @property
+    def parallel(self) -> bool:
+        """Whether it searches with as many threads as it is given."""
+        return "threads" in self._parameters
+
+    @property
     def _parameters(self) -> Mapping[str, inspect.Parameter]:
         return inspect.signature(self.factory).parameters
 
@@ -54,7 +60,8 @@ class TimedPlannerKind:
         objective = options.goal[0]
         offered: dict[str, Any] = {
             "objective": "effort" if objective == "moves" else objective, "seed": options.seed,
-            "alpha": options.alpha, "beta": options.beta, "options": options}
+            "alpha": options.alpha, "beta": options.beta, "threads": options.threads,
+            "options": options}
         if options.time_limit is not None:
             offered["time_limit"] = options.time_limit
         planner = self.factory(**{k: v for k, v in offered.items() if k in self._parameters})

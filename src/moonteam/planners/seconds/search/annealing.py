@@ -87,27 +87,28 @@ def decode(work, plan, space, goal, first, stable, most, rest, near, noise):
     latest, way, over = plan.sums[first, 0], plan.sums[first, 1], plan.sums[first, 2]
     alpha, beta, fine, tail = goal.alpha, goal.beta, goal.fine, plan.tail
     for i in range(first, m):
-        t = order[i]
+        t = np.uint64(order[i])  # without a sign no index is looked at for being negative
         when = ready[t]
         for e in range(first_before[t], first_before[t + 1]):
             b = before[e]
             when = max(when, (begin[b] if place[b] < first else trial[b]) + service[b])
         if size[t] == 0:
-            size[t] = choose(work, t, last, clock, when, near, noise, team[t], space.reach,
+            size[t] = choose(work, order[i], last, clock, when, near, noise, team[t], space.reach,
                              space.want)
             if size[t] == 0:
                 return np.inf
         for k in range(size[t]):
-            a = team[t, k]
-            leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
+            a = np.uint64(team[t, k])
+            leg = start[a, t] if last[a] < 0 else (
+                between[np.uint64(classes[a]), np.uint64(last[a]), t])
             way += effort[a] * leg
             when = max(when, clock[a] + leg)
         trial[t] = when
         end = when + service[t]
         for k in range(size[t]):
-            a = team[t, k]
+            a = np.uint64(team[t, k])
             clock[a] = end
-            last[a] = t
+            last[a] = order[i]
         latest = max(latest, float(end))
         if when > late[t]:
             over += when - late[t]

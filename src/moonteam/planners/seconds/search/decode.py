@@ -34,12 +34,14 @@ def choose(work, t, last, clock, when, near, noise, team, reach, want):
     if not work.single:
         return gather(work, t, last, clock, when, near, noise, team, reach, want)
     size = 0
+    at = np.uint64(t)  # without a sign no index is looked at for being negative
     for e in range(work.first_need[t], work.first_need[t + 1]):
         s = work.needed[e]
         low, wanted = size, work.need[t, s]
         for q in range(first[s], first[s + 1]):
-            a = able[q]
-            leg = start[a, t] if last[a] < 0 else between[classes[a], last[a], t]
+            a = np.uint64(able[q])
+            leg = start[a, at] if last[a] < 0 else (
+                between[np.uint64(classes[a]), np.uint64(last[a]), at])
             there = clock[a] + leg
             if near > 0.0 or noise > 0.0:
                 there += int(near * leg + noise * np.random.random())
@@ -54,7 +56,7 @@ def choose(work, t, last, clock, when, near, noise, team, reach, want):
             while k > low and reach[team[k - 1]] > there:
                 team[k] = team[k - 1]
                 k -= 1
-            team[k] = a
+            team[k] = able[q]
         if size < low + wanted:
             return 0
         if wanted > 0:
