@@ -1,11 +1,19 @@
 """What the environment of a process does to a command: one line, or no difference."""
 
+import ast
+import importlib
+import inspect
+import io
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from moonteam import cli, compilation, files
+from moonteam.commands import options
 
 BY_HAND = """
 import jax
@@ -40,8 +48,8 @@ for policy in ("any_team", "any_team_imitated"):
 
 
 def run(words, **environment):
-    return subprocess.run(words, env=os.environ | environment, capture_output=True, text=True,
-                          check=False)
+    return subprocess.run(words, env=os.environ | environment, capture_output=True,
+                          encoding="utf-8", check=False)
 
 
 def moonteam(*words, **environment):
@@ -98,3 +106,124 @@ def test_a_reader_that_goes_away_is_no_error():
     done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+OWN = [path for package in ("src/moonteam", "training", "sim2grid")
+       for path in sorted((Path(__file__).parents[1] / package).rglob("*.py"))]
+
+
+def test_no_assert_guards_what_users_do():
+    """PYTHONOPTIMIZE leaves them out: each only tells the type checker what is known already."""
+    assert len(OWN) > 100
+    for path in OWN:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Assert):
+                said = ast.unparse(node.test)
+                assert said.endswith(" is not None") or said.startswith(
+                    ("isinstance(", "all((isinstance(")), f"{path}:{node.lineno}: {said}"
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_is_there_without_docstrings(name):
+    kind = importlib.import_module(cli.COMMANDS[name][0]).Args
+    assert inspect.getdoc(kind)
+    assert options._docstring(kind) == inspect.getdoc(kind)
+
+
+BARE = {"PYTHONOPTIMIZE": "2", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0",
+        "PYTHONIOENCODING": "ascii", "COLUMNS": "100"}
+
+
+def test_without_docstrings_locale_caches_and_home(tmp_path):
+    """The same plan, and not a word about caches that cannot be written."""
+    (tmp_path / "file").write_text("no folder")
+    nowhere = str(tmp_path / "file" / "cache")
+    bare = BARE | {"HOME": nowhere, "XDG_CACHE_HOME": nowhere, "XDG_CONFIG_HOME": nowhere,
+                   "MOONTEAM_CACHE": nowhere, "MPLCONFIGDIR": nowhere}
+    mission = tmp_path / "mond.yaml"
+    mission.write_text(MISSION, encoding="utf-8")
+    words = ["plan", str(mission), "--planner", "greedy", "--out"]
+    plain = moonteam(*words, str(tmp_path / "a"), PYTHONUTF8="1")
+    done = moonteam(*words, str(tmp_path / "b"), **bare)
+    assert (plain.returncode, done.returncode) == (0, 0), done.stderr
+    assert done.stderr == plain.stderr == ""
+    assert "makespan 6 steps, 6 moves (Müller 6)" in plain.stdout
+    assert "makespan 6 steps, 6 moves (M\\u00fcller 6)" in done.stdout
+    assert plan_in(tmp_path / "b") == plan_in(tmp_path / "a")
+    assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["plan.json", "plan.png"]
+
+
+def plan_in(folder):
+    return json.loads((folder / "plan.json").read_text(encoding="utf-8")) | {"seconds": None}
+
+
+MISSION = """
+name: Süd
+map: {size: [8, 8], cell_m: 1.0}
+site: {preset: flat, seed: 0}
+max_steps: 50
+robots:
+  - {name: Müller, kind: wheeled, skills: [A], start: [0, 0]}
+targets:
+  - {name: Ziel, at: [3, 3], skills: [A], type: OR}
+"""
+
+
+def test_help_in_a_bare_environment():
+    words = ["replay", "--help"]
+    bare, plain = moonteam(*words, **BARE), moonteam(*words, COLUMNS="100")
+    assert bare.returncode == 0, bare.stderr
+    about = inspect.getdoc(importlib.import_module("moonteam.commands.replay").Args)
+    for line in about.splitlines():
+        assert line.strip() in bare.stdout
+        assert line.strip() in plain.stdout
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams(closed):
+    words = f"exec '{sys.executable}' -m moonteam.cli --version {closed}"
+    done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_character_that_the_terminal_lacks_is_written_as_json_would():
+    cli._mend_streams()
+    text = "Süd 🌕 \udcff"
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors="moonteam")
+    print(files.dump_json("Süd 🌕"), text, file=out, flush=True)
+    written = out.buffer.getvalue().decode("ascii")
+    assert written == '"S\\u00fcd \\ud83c\\udf15" S\\u00fcd \\ud83c\\udf15 \\udcff\n'
+    assert json.loads(f'"{written.strip().partition(chr(34) + " ")[2]}"') == text
+
+
+def test_a_name_that_the_file_system_lacks(monkeypatch):
+    monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "ascii")
+    assert files.safe_name("Mond: Süd", "mission") == "Mond-S-d"
+
+
+def test_a_process_without_a_home(monkeypatch):
+    for name in ("MOONTEAM_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as where there is no such user
+    assert compilation.cache_folder() == Path("~/.cache/moonteam")
+
+
+DOUBLE = """
+from moonteam.compilation import njit
+
+@njit(cache=True)
+def double(x):
+    return 2 * x
+"""
+
+
+def test_numba_where_it_can_keep_nothing(tmp_path):
+    """Neither beside the code nor in the user's folder."""
+    (tmp_path / "doubled.py").write_text(DOUBLE)
+    (tmp_path / "__pycache__").write_text("no folder")
+    nowhere = str(tmp_path / "doubled.py" / "cache")
+    done = run([sys.executable, "-c", "import doubled; print(doubled.double(21))"],
+               HOME=nowhere, XDG_CACHE_HOME=nowhere,
+               PYTHONPATH=os.pathsep.join([str(tmp_path), *sys.path]))
+    assert (done.returncode, done.stdout) == (0, "42\n"), done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["__pycache__", "doubled.py"]

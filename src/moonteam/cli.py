@@ -9,8 +9,11 @@ or SIGTERM (`interrupts`), 141 whoever read the output (`| head`) went away.
 
 from __future__ import annotations
 
+import codecs
 import errno
 import importlib
+import io
+import logging
 import os
 import sys
 from typing import Any
@@ -101,6 +104,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _guarded(words: list[str]) -> int:
     """The exit code, whatever is raised."""
+    _mend_streams()
     try:
         try:
             return _run(words)
@@ -123,6 +127,30 @@ def _guarded(words: list[str]) -> int:
             raise
         print(f"moonteam: {problem}", file=sys.stderr)
         return 2
+
+
+def _mend_streams() -> None:
+    """Lets any text out, whatever the locale: a character that it lacks is written as JSON would.
+
+    A stream that was closed before we began goes nowhere.
+    """
+    codecs.register_error("moonteam", _escaped)
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            # The file keeps its number from what is opened next.
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w",  # noqa: SIM115
+                                    encoding="utf-8"))
+        elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="moonteam")
+
+
+def _escaped(error: UnicodeError) -> tuple[str, int]:
+    """Of a text that cannot be encoded, in place of what cannot, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    wide = error.object[error.start:error.end].encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{wide[k]:02x}{wide[k + 1]:02x}" for k in range(0, len(wide), 2)), error.end
 
 
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR,
@@ -151,6 +179,8 @@ def _surroundings() -> str | None:
 
 
 def _run(words: list[str]) -> int:
+    # It says twice that its cache cannot be written, which changes nothing.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     # With 64 bits JAX draws other numbers, and the same seed would give other results.
     os.environ["JAX_ENABLE_X64"] = "0"
     if not words or words[0] in ("-h", "--help", "help"):

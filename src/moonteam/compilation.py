@@ -99,12 +99,15 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Numba's decorator, without its cache where that has nowhere to be, or no room."""
     import numba
 
+    jit: Any = numba.njit
+
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            made: Any = numba.njit(**options)(function)
+            made = jit(**options)(function)
         except RuntimeError:
-            uncached: dict[str, Any] = options | {"cache": False}
-            return numba.njit(**uncached)(function)
+            return jit(**options | {"cache": False})(function)
+        if not hasattr(made, "_cache"):  # NUMBA_DISABLE_JIT
+            return made
         save = made._cache.save_overload
 
         def save_if_possible(signature: Any, data: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -140,7 +141,8 @@ def append(path: Path, text: str) -> None:
             while data:  # a full disk may take a part of it
                 data = data[file.write(data):]
         except OSError as error:
-            file.truncate(end)
+            with contextlib.suppress(OSError):  # no common file
+                file.truncate(end)
             raise _unwritten(path, error) from None
 
 
@@ -170,7 +172,9 @@ def safe_name(name: str, otherwise: str) -> str:
 
     Letters and digits of any language, dots, hyphens and underlines stay; the rest is a hyphen.
     """
-    plain = re.sub(r"[^\w.-]+", "-", name).strip(".-")
+    # A file system whose encoding is not UTF-8 lacks some of them.
+    known = os.fsdecode(name.encode(sys.getfilesystemencoding(), "replace"))
+    plain = re.sub(r"[^\w.-]+", "-", known).strip(".-")
     return plain[:100] or otherwise
 
 

@@ -8,11 +8,13 @@ counts updates over all phases.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import tempfile
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
@@ -127,23 +129,43 @@ def save(folder: Path, state: Any, about: About, keep: Iterable[int] = ()) -> Pa
     try:
         folder.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(dir=folder, prefix=".part-"))
-        ocp.PyTreeCheckpointer().save(partial.resolve() / "learner", arrays)
+        with _without_tracebacks():
+            ocp.PyTreeCheckpointer().save(partial.resolve() / "learner", arrays)
         sums = checksums(partial / "learner")
         files.write_json(partial / "about.json", msgspec.structs.replace(about, files=sums))
         if place.exists():
             shutil.rmtree(place)
         partial.rename(place)
-    except (OSError, ValueError) as error:  # tensorstore reports a full disk as ValueError
+    # tensorstore reports a full disk as ValueError
+    except (OSError, ValueError, InputError) as error:
         last = newest(folder)
         kept = f"; the last good checkpoint is {last}" if last else ""
-        problem = str(error).splitlines()[0]
-        raise InputError(place, f"checkpoint could not be written: {problem}{kept}") from None
+        raise InputError(place, f"checkpoint could not be written: {_why(error)}{kept}") from None
     finally:
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
     for old in set(_all(folder)[:-KEEP]) - {place_of(folder, updates) for updates in keep}:
         shutil.rmtree(old, ignore_errors=True)
     return place
+
+
+@contextmanager
+def _without_tracebacks() -> Iterator[None]:
+    """Orbax logs those of its threads, whose error it raises anyway."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _why(error: Exception) -> str:
+    """The last words of an error; tensorstore tells its whole way down to the system's."""
+    text = error.problem if isinstance(error, InputError) else str(error)
+    head, number, _ = text.splitlines()[0].partition(" [os_error_code")
+    return head.rpartition(": ")[2] if number else head
 
 
 def read(place: Path, expect: Expect | None = None) -> tuple[About, dict[str, np.ndarray]]:

@@ -169,7 +169,7 @@ class Pupil(ABC):
 
     def enter(self, phase: str) -> None:
         """There is no other."""
-        assert phase == self.phase
+        return
 
     def chunk(self, at: Position) -> Made:
         """One round."""

@@ -15,7 +15,7 @@ from moonteam.commands.options import Printed
 PACKAGES = ("jax", "flax", "mujoco", "mujoco-mjx", "terraingenpy", "rasterio", "numba", "ortools")
 
 RENDER_PROBE = """
-import os
+import os, sys
 os.environ.setdefault("MUJOCO_GL", "egl")
 import mujoco
 model = mujoco.MjModel.from_xml_string(
@@ -24,8 +24,9 @@ data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
 renderer = mujoco.Renderer(model, 48, 64)
 renderer.update_scene(data)
-assert renderer.render().max() > 0
-os._exit(0)
+drawn = renderer.render().max() > 0
+print("" if drawn else "the picture is black", file=sys.stderr, flush=True)
+os._exit(not drawn)
 """
 
 
@@ -55,8 +56,8 @@ def versions() -> dict[str, str | None]:
 
 def rendering() -> tuple[bool, str]:
     """Whether a frame can be drawn without a screen; a process of its own, since GL may abort."""
-    done = subprocess.run([sys.executable, "-c", RENDER_PROBE], capture_output=True, text=True,
-                          timeout=120, check=False)
+    done = subprocess.run([sys.executable, "-c", RENDER_PROBE], capture_output=True,
+                          encoding="utf-8", errors="replace", timeout=120, check=False)
     if done.returncode == 0:
         return True, "works (MUJOCO_GL=" + os.environ.get("MUJOCO_GL", "egl") + ")"
     last = (done.stderr.strip().splitlines() or ["no message"])[-1]

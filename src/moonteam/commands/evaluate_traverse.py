@@ -163,7 +163,8 @@ def _film(args: Args, name: str, shot: Shot, recording: Recording, stills: list)
 
 
 def _write_csv(path: Path, rows: list[Traverse]) -> None:
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+    with replacing(path) as temporary, temporary.open(
+            "w", encoding="utf-8", newline="") as file:
         table = [asdict(row) for row in rows]
         writer = csv.DictWriter(file, list(table[0]))
         writer.writeheader()

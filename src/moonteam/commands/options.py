@@ -7,7 +7,10 @@ the groups are given by name only, so that a command can have required ones of i
 
 from __future__ import annotations
 
+import ast
 import inspect
+import sys
+import textwrap
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -33,11 +36,20 @@ def parse(kind: type[T], name: str, words: Sequence[str], default: T | None = No
 
     With a `default`, whose values then are the options' own, each flag has its opposite too.
     """
-    prog, about = f"moonteam {name}", inspect.getdoc(kind)
+    # PYTHONOPTIMIZE=2 leaves docstrings out, and dataclasses put something else in their place.
+    about = _docstring(kind) if sys.flags.optimize > 1 else inspect.getdoc(kind)
+    prog = f"moonteam {name}"
     if default is not None:
         return tyro.cli(kind, prog=prog, args=words, default=default, description=about)
     return tyro.cli(kind, prog=prog, args=words, description=about,
                     config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def _docstring(kind: type) -> str | None:
+    """Of a class, from its source."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+    body = tree.body[0]
+    return ast.get_docstring(body) if isinstance(body, ast.ClassDef) else None
 
 
 def keeping(args: Any, names: Sequence[str]) -> AbstractContextManager[None]:

@@ -27,7 +27,8 @@ def commit() -> str | None:
 def git(folder: Path, *words: str) -> str | None:
     """What git says in a folder; None where it knows nothing."""
     try:
-        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True,
+        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True,
+                              encoding="utf-8", errors="surrogateescape",
                               timeout=20, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None

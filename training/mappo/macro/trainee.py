@@ -88,7 +88,6 @@ class MacroMappo:
 
     def enter(self, phase: str) -> None:
         """There is no other."""
-        assert phase == PHASE
 
     def chunk(self, at: Position) -> Made:
         """`chunk_rounds`, or what is left; each family in turn in every round."""
