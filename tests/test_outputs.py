@@ -248,3 +248,84 @@ def test_a_clock_that_stands_still_is_no_lock(tmp_path):
     os.utime(tmp_path / outputs.LOCK, (4e9, 4e9))  # years from now
     write(tmp_path, "x")
     assert texts(tmp_path) == {"a.txt": "x", "b.txt": "x"}
+
+
+WRITERS = {
+    "plan": ("plan outpost", "plan.json"),
+    "replay": ("replay s.json a.json", "replay.json"),
+    "site": ("site --preset flat", "heights.tif"),
+    "evaluate grid": ("evaluate grid 3x5", "rows.csv"),
+    "evaluate sets": ("evaluate sets", "report.json"),
+    "evaluate replanning": ("evaluate replanning", "replanning.png"),
+    "evaluate peers": ("evaluate peers", "peers.json"),
+    "evaluate timing": ("evaluate timing", "timing.csv"),
+    "evaluate preference": ("evaluate preference 3x5 --policy any_team", "preference.png"),
+    "evaluate traverse": ("evaluate traverse", "wheeled-rim.mp4"),
+    "evaluate slopes": ("evaluate slopes", "slopes.json"),
+    "evaluate execution": ("evaluate execution", "rows.jsonl"),
+    "evaluate sensitivity": ("evaluate sensitivity", "curves.png"),
+    "bench grid": ("bench grid", "bench.json"),
+    "bench travel": ("bench travel", "table.md"),
+    "bench train": ("bench train", "bench_train.json"),
+    "bench physics": ("bench physics", "bench_physics.json"),
+    "bench execution": ("bench execution", "table.md"),
+    "rollout": ("rollout outpost", "video.mp4"),
+    "train": ("train small", "metrics.jsonl"),
+    "train quick": ("train quick", "checkpoints"),
+    "train imitate": ("train imitate quick", "policy.safetensors"),
+    "train compare": ("train compare runs/none", "curves.png"),
+    "testsets": ("testsets --sets 3x5", "3x5.jsonl"),
+}
+
+
+def test_every_writer_is_asked():
+    known = {name for name in cli.COMMANDS if not name.startswith(("check", "doctor"))}
+    assert known - set(WRITERS) == {"export", "testsets import"}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_command_leaves_what_is_there(tmp_path, name, capsys):
+    """Before it reads or computes anything: even what it was asked for may be missing."""
+    words, held = WRITERS[name]
+    out = tmp_path / "out"
+    for link in (False, True):
+        if link:
+            (out / held).rename(tmp_path / "mine")
+            (out / held).symlink_to(tmp_path / "mine")
+        else:
+            out.mkdir()
+            (out / held).write_text("mine")
+        assert cli.main([*words.split(), "--out", str(out)]) == 2
+        line = f"moonteam: {out}: holds {held}" + (", a symbolic link" if link else " already")
+        assert capsys.readouterr().err.startswith(line)
+        assert [path.name for path in out.iterdir()] == [held]
+        assert (out / held).is_symlink() == link
+        assert (out / held).read_text() == "mine"
+
+
+@pytest.mark.parametrize("words", ["export any_team --out mine.onnx",
+                                   "testsets import none --format dcmrta --out mine.jsonl"])
+def test_one_file_that_is_there(tmp_path, monkeypatch, words, capsys):
+    monkeypatch.chdir(tmp_path)
+    name = words.split()[-1]
+    (tmp_path / name).write_text("mine")
+    assert cli.main(words.split()) == 2
+    assert capsys.readouterr().err == (f"moonteam: {name}: is there already; --force replaces it, "
+                                       "or choose another --out\n")
+    assert texts(tmp_path) == {name: "mine"}
+
+
+def test_every_command_says_who_has_its_folder(tmp_path, capsys):
+    child = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE,
+                             text=True)
+    try:
+        assert child.stdout is not None
+        child.stdout.readline()
+        for words in ("train quick --resume", "train small --force", "evaluate execution --resume",
+                      "rollout outpost --force", "plan outpost"):
+            assert cli.main([*words.split(), "--out", str(tmp_path)]) == 2
+            assert capsys.readouterr().err.startswith(
+                f"moonteam: {tmp_path}: is in use by process {child.pid} on ")
+    finally:
+        child.kill()
+        child.communicate()

@@ -260,6 +260,22 @@ def test_resuming_with_other_numbers_or_over_a_run_is_refused(tmp_path):
         Run(Mappo(dataclasses.replace(TINY, gamma=0.9)), tmp_path, resume=True)
 
 
+def test_a_forced_run_begins_anew_and_takes_nothing_but_the_run(whole, tmp_path):
+    """What it would go on from must be elsewhere, and a bad beginning leaves the run there."""
+    out = tmp_path / "run"
+    shutil.copytree(whole.out, out)
+    (out / "notes.txt").write_text("mine")
+    before = checkpoints.newest(out / "checkpoints")
+    with pytest.raises(InputError, match=r"--begin: .* is in the folder that --force would empty"):
+        Run(Mappo(TINY), out, resume=False, begin=before, force=True)
+    assert checkpoints.newest(out / "checkpoints") == before
+    run = Run(Mappo(TINY), out, resume=False, force=True)
+    assert run.position.total_updates == 0
+    assert sorted(path.name for path in out.iterdir()) == ["config.json", "metrics.jsonl",
+                                                           "notes.txt"]
+    assert not (out / "metrics.jsonl").read_text()
+
+
 def test_beginning_where_another_runs_bootstrap_ended(whole, tmp_path):
     """The same numbers end with the same bits; others change what comes after, and only that."""
     end = whole.out / "checkpoints" / "00000004"
