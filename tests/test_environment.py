@@ -174,6 +174,7 @@ def test_help_in_a_bare_environment():
     bare, plain = moonteam(*words, **BARE), moonteam(*words, COLUMNS="100")
     assert bare.returncode == 0, bare.stderr
     about = inspect.getdoc(importlib.import_module("moonteam.commands.replay").Args)
+    assert "Print one JSON document and nothing else." in bare.stdout, "of an option"
     for line in about.splitlines():
         assert line.strip() in bare.stdout
         assert line.strip() in plain.stdout

@@ -214,8 +214,11 @@ def _locked(path: Path) -> Iterator[None]:
     handle = _lock(path, lock)
     try:
         if handle is not None:
-            os.ftruncate(handle, 0)
-            os.write(handle, os.fsencode(_who()))
+            try:
+                os.ftruncate(handle, 0)
+                os.write(handle, os.fsencode(_who()))
+            except OSError as error:
+                raise InputError(path, f"cannot be written to: {error.strerror}") from None
         yield
     finally:
         if handle is not None:

@@ -102,13 +102,14 @@ def test_what_cannot_be_is_one_line(words, says, tiny, capsys):
     assert message.count("\n") == 1
 
 
-def test_a_policy_that_points_plans_and_drives(tiny, pointing, capsys):
+def test_a_policy_that_points_plans_and_drives(tiny, pointing, tmp_path, capsys):
     words = [tiny, "--planner", "policy", "--policy", pointing]
     plan = printed(capsys, "plan", *words)
     assert (plan["planner"], plan["status"], plan["bound"]) == ("policy", "feasible", None)
     look, core = sorted(plan["schedule"], key=lambda one: one["target"])
     assert core["start"] >= look["end"]
-    report = printed(capsys, "rollout", *words, "--backend", "native", "--no-video")
+    report = printed(capsys, "rollout", *words, "--backend", "native", "--no-video",
+                     "--out", str(tmp_path / "out"))
     assert report["success"]
     assert report["planner"] == "policy"
     assert report["expected_s"] == pytest.approx(plan["makespan"], abs=6)

@@ -118,7 +118,8 @@ def test_the_recurrent_network_goes_too(tmp_path, capsys):
         config = {**dataclasses.asdict(spec), "size": list(spec.size)}
         params = random_weights(lambda key, spec=spec: recurrent.init(spec, key))
         save_policy(path, PolicyFile("recurrent", config, params))
-        assert main(["export", str(path), "--out", str(tmp_path / "x.onnx"), "--states", "20"]) == 0
+        out = str(path.with_suffix(".onnx"))
+        assert main(["export", str(path), "--out", out, "--states", "20"]) == 0
         assert "100.00%" in capsys.readouterr().out
 
 
