@@ -58,7 +58,8 @@ LAUGHS = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
     (LAUGHS, "its aliases stand for too many values"),
     ("a: *b", "found undefined alias 'b'"),
     ("a: 1\n---\na: 2", "but found another document"),
-    ("a: " + "[" * 500_000, "is nested too deeply"),
+    ("a: " + "[" * 500_000, "is nested too deeply"), ("[" * 65, "is nested too deeply"),
+    ("- " * 65, "is nested too deeply"),
     ("a: " + "x" * 524_288, "is too long: 524,291 characters; at most 524,288"),
     (r'a: "\ud800"', r"holds half a character (\ud800 to \udfff) (line 1)"),
 ])

@@ -23,6 +23,8 @@ MOST_JSON = 16 << 20
 """Characters of a JSON text, such as a line of a set: it takes ten times as many bytes."""
 MOST_YAML = 1 << 19
 """Characters of a YAML text: some ten seconds of reading."""
+MOST_DEEP = 64
+"""Lists and mappings inside each other, in YAML."""
 DEEP = "is nested too deeply"
 HALF = "holds half a character (\\ud800 to \\udfff)"
 _HALF = re.compile("[\ud800-\udfff]")
@@ -91,7 +93,20 @@ def _short(text: str) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Numbers, truth values and null as in the core schema of YAML 1.2; all else is text."""
+    """Numbers, truth values and null as in the core schema of YAML 1.2; all else is text.
+
+    Depth is bounded where it begins: a token costs PyYAML as much as there are brackets about it.
+    """
+
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
+        if self.flow_level >= MOST_DEEP:
+            raise RecursionError
+        super().fetch_flow_collection_start(TokenClass)
+
+    def add_indent(self, column: int) -> bool:
+        if len(self.indents) >= MOST_DEEP:
+            raise RecursionError
+        return super().add_indent(column)
 
 
 _Loader.yaml_implicit_resolvers = {}  # its own, to be filled below
