@@ -75,6 +75,11 @@ def test_a_world_that_blows_up_stops_alone(scene, mjx_backend):
         assert np.allclose(after.qpos[1], state.qpos[1], atol=1e-6)
         assert np.abs(after.qpos[0] - state.qpos[0])[0] > 1e-3
         assert not np.asarray(log.power[1]).any()
+        whole = backend.reset(batch=2)
+        calm, calm_log = backend.advance(whole, push(scene, 2, (1.0, 1.0)), STEPS)
+        for one, other in ((after.qpos, calm.qpos), (after.qvel, calm.qvel), *zip(
+                log, calm_log, strict=True)):
+            assert np.asarray(one)[0].tobytes() == np.asarray(other)[0].tobytes()
         again, _ = backend.advance(after, push(scene, 2, (1.0, 1.0)), STEPS)
         assert np.allclose(again.qpos[1], after.qpos[1])
 

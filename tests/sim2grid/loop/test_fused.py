@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from moonteam import paths
+from moonteam import files, paths
 from moonteam.errors import InputError
-from moonteam.physics.backends import MjxBackend
+from moonteam.physics.backends import MjxBackend, NativeBackend
 from moonteam.planners import registry
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
@@ -66,17 +66,33 @@ def fleet(missions):
     return fleet_of(missions, [1] * len(missions), for_mission(missions[0]), free)
 
 
-def both(crew, backend, decider, params, bodies, rules, max_steps):
-    """Records of all missions of a fleet: (fused, step by step), in pairs."""
-    program = Fused(backend, crew.frame, bodies, decider, max_steps=max_steps, rules=rules,
-                    seconds=None)
-    outcome = program.run(crew.scenarios, crew.starts, params)
+def fused(crew, backend, decider, rules, max_steps):
+    """The program of a fleet."""
+    return Fused(backend, crew.frame, crew.bodies, decider, max_steps=max_steps, rules=rules,
+                 seconds=None)
+
+
+def records(crew, program, outcome):
+    """Of all missions of a fleet."""
+    return [record_of(program.setup, outcome, k, m, s)
+            for k, (m, s) in enumerate(zip(crew.missions, crew.scenarios, strict=True))]
+
+
+def stepped(crew, backend, decider, params, rules):
+    """Records of all missions of a fleet, step by step."""
     executions = [
-        Execution(m, s, DeciderPlanner(decider, params[k:k + 1]), bodies, crew.frame, rules=rules)
+        Execution(m, s, DeciderPlanner(decider, params[k:k + 1]), crew.bodies, crew.frame,
+                  rules=rules)
         for k, (m, s) in enumerate(zip(crew.missions, crew.scenarios, strict=True))]
     run(executions, backend, crew.starts)
-    return [(record_of(program.setup, outcome, k, e.asked.mission, e.asked.scenario), e.record)
-            for k, e in enumerate(executions)]
+    return [execution.record for execution in executions]
+
+
+def both(crew, backend, decider, params, rules, max_steps):
+    """Records of all missions of a fleet: (fused, step by step), in pairs; and the program."""
+    program = fused(crew, backend, decider, rules, max_steps)
+    ours = records(crew, program, program.run(crew.scenarios, crew.starts, params))
+    return list(zip(ours, stepped(crew, backend, decider, params, rules), strict=True)), program
 
 
 def check_same(ours, theirs):
@@ -131,10 +147,17 @@ def scripts(*each):
     return np.stack(rows)
 
 
-def test_a_mixed_team_swaps_falls_and_is_lost_alike(crew, backend):
-    joint = scripts(["down right left", "stay stay left"],
-                    ["left up right", "stay stay right"], ["left up right", "stay stay up"])
-    pairs = both(crew, backend, Script(), joint, crew.bodies, Rules(), STEPS)
+JOINT = scripts(["down right left", "stay stay left"],
+                ["left up right", "stay stay right"], ["left up right", "stay stay up"])
+
+
+@pytest.fixture(scope="module")
+def played(crew, backend):
+    return both(crew, backend, Script(), JOINT, Rules(), STEPS)
+
+
+def test_a_mixed_team_swaps_falls_and_is_lost_alike(played):
+    pairs, _ = played
     for ours, theirs in pairs:
         check_same(ours, theirs)
     calm, fallen, needed = (theirs for _, theirs in pairs)
@@ -147,6 +170,61 @@ def test_a_mixed_team_swaps_falls_and_is_lost_alike(crew, backend):
     assert needed.failure == "unsolvable"
 
 
+def spoiled(state, row):
+    """The state with one velocity of one world that is not a number."""
+    return state._replace(qvel=jnp.asarray(state.qvel).at[row, 3].set(jnp.nan))
+
+
+@dataclass
+class Spoiling:
+    """A backend in which a number of one world is none from some look on."""
+
+    backend: object
+    row: int
+    look: int
+
+    @property
+    def log_every(self):
+        return self.backend.log_every
+
+    def reset(self, qpos=None, batch=1):
+        return self.backend.reset(qpos, batch)
+
+    def advance(self, state, commands, steps):
+        self.look -= 1
+        return self.backend.advance(spoiled(state, self.row) if self.look == 0 else state,
+                                    commands, steps)
+
+
+def check_contained(before, after, row, decisions):
+    """The mission of that row ends by its cause; all others are as before, to the bit."""
+    for k, (one, other) in enumerate(zip(before, after, strict=True)):
+        if k == row:
+            assert (other.success, other.failure) == (False, "engine")
+            assert other.detail == "the physics diverged (not a number, or far too fast)"
+            assert len(other.decisions) == decisions
+            continue
+        assert (other.success, other.failure, other.detail) == (
+            one.success, one.failure, one.detail)
+        assert np.concatenate(other.qpos).tobytes() == np.concatenate(one.qpos).tobytes()
+        assert files.dump_json(other.legs) == files.dump_json(one.legs)
+        assert other.solves == one.solves
+
+
+def test_what_is_no_number_ends_its_own_mission_alone(crew, backend, played):
+    """In C MuJoCo, in MJX step by step, and in the fused program."""
+    pairs, program = played
+    native = NativeBackend(crew.scene)
+    calm = stepped(crew, native, Script(), JOINT, Rules())
+    for engine, before in ((native, calm), (backend, [theirs for _, theirs in pairs])):
+        after = stepped(crew, Spoiling(engine, 1, 3), Script(), JOINT, Rules())
+        check_contained(before, after, 1, 1)
+    *given, worlds = program._arguments(crew.scenarios, crew.starts, JOINT)
+    arguments = (*given, spoiled(worlds, 0))
+    outcome = program._program(arguments)(*arguments)
+    check_contained([ours for ours, _ in pairs], records(crew, program, outcome), 0, 1)
+
+
 @pytest.mark.soak
 def test_a_mixed_team_is_late_and_stuck_alike(crew, backend):
     """The robot on its back is only late, three times; what it could not enter is closed."""
@@ -154,7 +232,7 @@ def test_a_mixed_team_is_late_and_stuck_alike(crew, backend):
     waits = ["stay stay right", "stay stay up", "stay stay left"]
     joint = scripts(["down right left", "stay stay left"],
                     [*waits, "left up stay"], waits)
-    pairs = both(crew, backend, Script(), joint, crew.bodies, hurried, STEPS)
+    pairs, _ = both(crew, backend, Script(), joint, hurried, STEPS)
     for ours, theirs in pairs:
         check_same(ours, theirs)
     _, late, needed = (theirs for _, theirs in pairs)
