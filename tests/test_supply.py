@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -42,10 +43,15 @@ COMMANDS = (["plan", "outpost", "--planner", "exact", "--out", "plan"],
             ["doctor"], ["doctor", "--licences"])
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imported(path: Path) -> set[str]:
     """Top-level names of what a file imports."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found |= {one.name.split(".")[0] for one in node.names}
         elif isinstance(node, ast.ImportFrom) and not node.level:
@@ -82,7 +88,7 @@ def test_nothing_that_is_read_is_run():
     """No pickle nor its kin, no eval, arrays without objects, YAML without constructors."""
     for path in SOURCES:
         assert not imported(path) & CODE, path
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Call):
                 called = ast.unparse(node.func)
                 given = {word.arg: ast.unparse(word.value) for word in node.keywords}

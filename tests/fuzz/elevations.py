@@ -15,7 +15,7 @@ from affine import Affine
 
 from moonteam.terrain import dem
 from moonteam.terrain.site import import_dem
-from tests.fuzz.mutation import Pairs, harmed, tree_of, written
+from tests.fuzz.mutation import Pairs, harmed, put, tree_of, written
 
 MOON = "+proj=stere +lat_0=-85 +R=1737400 +units=m +no_defs"
 LETTERS = {1: "B", 2: "B", 3: "H", 4: "I", 6: "b", 7: "B", 8: "h", 9: "i", 11: "f", 12: "d",
@@ -91,8 +91,7 @@ def write(folder: Path, tree: Any, harm: int) -> Path:
     else:
         data = _with_tags(data, held.get("tags"))
         path = folder / "input.tif"
-    path.write_bytes(harmed(data, harm))
-    return path
+    return put(path, harmed(data, harm))
 
 
 def _with_tags(data: bytes, tags: Any) -> bytes:

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hypothesis import strategies as st
+
+quoted = json.encoder.encode_basestring_ascii
 
 
 class Pairs(list):
@@ -74,10 +77,12 @@ def written(tree: Any) -> str:
     if isinstance(tree, Inside):
         return json.dumps(written(tree.tree))
     if isinstance(tree, Pairs):
-        return "{" + ", ".join(f"{json.dumps(key)}: {written(v)}" for key, v in tree) + "}"
+        return "{" + ", ".join([f"{quoted(key)}: {written(v)}" for key, v in tree]) + "}"
     if isinstance(tree, list):
-        return "[" + ", ".join(map(written, tree)) + "]"
-    return json.dumps(tree)
+        return "[" + ", ".join([written(inner) for inner in tree]) + "]"
+    if isinstance(tree, str):
+        return quoted(tree)
+    return repr(tree) if type(tree) is int else json.dumps(tree)
 
 
 def slots(tree: Any) -> list[tuple[list, int]]:
@@ -192,3 +197,10 @@ def harmed(data: bytes, harm: int) -> bytes:
     else:
         held[at:at] = held[at:at + 1 + byte]
     return bytes(held)
+
+
+def put(path: Path, data: bytes) -> Path:
+    """A new file: to write over one takes the disk a while."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(data)
+    return path

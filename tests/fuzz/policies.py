@@ -14,7 +14,7 @@ import numpy as np
 from moonteam.policies import entity, pointer, recurrent
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import PolicyFile, save_policy
-from tests.fuzz.mutation import Inside, Pairs, harmed, tree_of, written
+from tests.fuzz.mutation import Inside, Pairs, harmed, put, tree_of, written
 
 SPECS = {"pointer": (pointer, pointer.PointerSpec(width=4, heads=2, layers=1, pairs=2)),
          "entity": (entity, entity.EntitySpec(width=4, heads=2, layers=1)),
@@ -60,13 +60,13 @@ def write(folder: Path, tree: Any, harm: int) -> Path:
     except ValueError:
         data = b"\0" * 99
     path = folder / "input.safetensors"
-    path.write_bytes(harmed(struct.pack("<Q", length % 2**64) + header + data, harm))
-    return path
+    return put(path, harmed(struct.pack("<Q", length % 2**64) + header + data, harm))
 
 
 def read(path: Path) -> None:
     """As every command that takes a policy does."""
     found = Policy.load(path)
     again = path.with_name("again.safetensors")
+    again.unlink(missing_ok=True)
     save_policy(again, found.source)
     assert Policy.load(again).brain == found.brain

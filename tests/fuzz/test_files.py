@@ -23,7 +23,7 @@ from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
 from tests.fuzz import elevations, policies, states
-from tests.fuzz.mutation import Pairs, changes, harm, harmed, mutated, tree_of, written
+from tests.fuzz.mutation import Pairs, changes, harm, harmed, mutated, put, tree_of, written
 from tests.fuzz.watch import answer
 
 FEW, ROUND, MANY = 60, 2500, 100_000
@@ -35,6 +35,12 @@ EVENTS = [
     {"at_decision": 5, "silent": {"robot": "hopper", "decisions": 2}},
     {"at_decision": 6, "impassable": {"kind": "legged", "at": [0, 0]}},
     {"at_decision": 7, "target": {"at": [1, 1], "skills": ["A"]}}]
+
+BLOCKED = {
+    "size": [6, 5], "id": "b", "max_steps": 64, "blocked": {"*": [[1, 1]], "drone": [[2, 1]]},
+    "agents": [{"at": [0, 0], "skills": ["A", "drill"], "kind": "drone"}],
+    "targets": [{"at": [3, 3], "skills": ["drill"], "type": "OR"}],
+    "optimal": {"makespan": 6, "moves": 6, "bound_moves": 6}}
 
 
 @dataclass
@@ -59,12 +65,11 @@ class Kind:
 
 def text_file(suffix: str) -> Callable[[Path, Any, int], Path]:
     def write(folder: Path, tree: Any, harm: int) -> Path:
-        path = folder / f"input{suffix}"
         lines = tree if suffix == ".jsonl" and not isinstance(tree, Pairs) else [tree]
         text = tree if isinstance(tree, str) else "\n".join(map(written, lines))
         data = text.encode("utf-8", "surrogatepass")
-        path.write_bytes(harmed(data[:MOST_YAML] if suffix == ".yaml" else data, harm))
-        return path
+        return put(folder / f"input{suffix}",
+                   harmed(data[:MOST_YAML] if suffix == ".yaml" else data, harm))
 
     return write
 
@@ -84,7 +89,7 @@ def lines(name: str, count: int) -> list[Any]:
 def read_mission(path: Path) -> None:
     found = loading.load_mission(str(path))
     again = path.with_name("again.yaml")
-    files.write_json(again, found)
+    put(again, files.dump_json(found).encode())
     assert loading.load_mission(str(again)) == found
     used(found.scenario())
 
@@ -93,7 +98,7 @@ def read_problems(path: Path) -> None:
     found: Any = loading.load(path)
     several = found if isinstance(found, list) else [found]
     again = path.with_name("again.jsonl")
-    files.write_lines(again, several)
+    put(again, "\n".join(map(files.dump_json, several)).encode())
     assert loading.load(again) == several
     for one in several:
         used(one)
@@ -115,7 +120,7 @@ def used(one: Mission | Scenario | Timed) -> None:
 
 PLAIN = [
     Kind("missions", missions(), text_file(".yaml"), read_mission, 15),
-    Kind("scenarios", [*lines("3x5", 3), *lines("3x6-blocked", 1), *lines("4x6-3skills", 2)],
+    Kind("scenarios", [*lines("3x5", 3), *lines("4x6-3skills", 1), tree_of(BLOCKED)],
          text_file(".json"), read_problems, 25),
     Kind("test sets", [lines("2x3", 3), lines("5x5", 2), [*lines("2x3", 1), *lines("3x5", 1)]],
          text_file(".jsonl"), read_problems, 10),
