@@ -61,6 +61,13 @@ def more(value, key, **said):
     (more(CLOCKED, "robots", speed=1e-300), "robots[0].speed: 1e-300 is not allowed; at least"),
     (CLOCKED | {"max_seconds": 1e300}, "max_seconds: 1e+300 is not allowed; above 0, at most"),
     (CLOCKED | {"events": [{"at_s": 1e300, "lost": "a"}]}, "events[0].at_s: 1e+300 is not allow"),
+    (CLOCKED | {"events": [{"at_s": 1, "target": {"at": [1, 1], "skills": ["A"],
+                                                  "service": 1e300}}]},
+     "events[0].target.service: 1e+300 is not allowed"),
+    (CLOCKED | {"events": [{"at_s": 1, "target": {"at": [1, 1], "coalition": {"A": 2}}}]},
+     "events[0].target.coalition.A: 2 robots with it are needed; the team has 1"),
+    (DEMO | {"map": {"size": [1024, 1024]}, "targets": [
+        {"at": [i % 30, i // 30], "skills": ["A"]} for i in range(300)]}, "map.size: [1024, 1024]"),
     (DEMO | {"events": [{"at_decision": 10**30, "lost": "a"}]}, "1 to 100000"),
 ], ids=lambda value: value[:30] if isinstance(value, str) else "")
 def test_missions(tmp_path, value, line):

@@ -43,6 +43,7 @@ class Args(Printed):
     licences: bool = False
     """Say instead what moonteam needs to run: name, version and licence of every package."""
 
+
 def versions() -> dict[str, str | None]:
     """Installed version of each package that matters; None where it is missing."""
     found: dict[str, str | None] = {}

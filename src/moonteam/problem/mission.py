@@ -198,6 +198,10 @@ def check(mission: Mission, source: object) -> Mission:
         raise InputError(source, "at least one robot is needed", "robots")
     _check_clock(mission, source)
     _as_mission_keys(mission, source)
+    if mission.clock == "steps":  # by the clock ways are found one by one
+        scenario.check_ways(mission.map.size, len({robot.kind for robot in mission.robots}),
+                            len(mission.targets) + len(mission.events),
+                            lambda problem: InputError(source, problem, "map.size"))
     _check_skills(mission, mission.targets, source, "targets[{}].skills")
     for e, event in enumerate(mission.events):
         _check_event(mission, event, source, f"events[{e}]")
@@ -313,6 +317,13 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
     if event.target is not None:
         _check_cell(mission, event.target.cell, source, f"{key}.at")
         _check_skills(mission, (event.target,), source, f"{key}.skills")
+        if mission.clock == "seconds":
+            def fail(part: str, problem: str) -> InputError:
+                return InputError(source, problem.replace("agent", "robot"), f"{key}.{part}")
+
+            timed.check_times(event.target, fail)
+            timed.check_coalition(event.target, timed.headcount(
+                robot.skills for robot in mission.robots), fail)
     if event.slow is not None:
         _check_robot(mission, event.slow.robot, source, f"{key}.robot")
         if not 0.1 <= event.slow.factor <= 1:
