@@ -28,7 +28,9 @@ def main():
 
 def started():
     with interrupts.handled():
-        return main()
+        code = main()
+        if interrupts.asked():
+            interrupts.leave(code or 0)
 """
 ENDLESS = 1 << 31
 NUMBERS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -37,11 +39,11 @@ NUMBERS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def run(work, *signals, ignored=()):
     """(code, standard output, standard error, s from the last signal to the end) of some work."""
     def ignore():
-        for number in ignored:
-            signal.signal(number, signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
 
     child = subprocess.Popen(
-        [sys.executable, "-c", f"{BEGIN}\ndef work():\n    {work}\nsys.exit(started())"],
+        [sys.executable, "-c", f"{BEGIN}\ndef work():\n    {work}\nstarted()"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=ignore)
     assert child.stdout.readline() == b"ready\n"
     said = b""
@@ -96,6 +98,21 @@ def test_between_two_pieces_the_first_signal_only_asks():
     code, out, err, _ = run(work.strip(), signal.SIGTERM)
     assert (code, out) == (0, "finished\n")
     assert "stopping" in err
+
+
+def test_an_exception_that_python_drops_is_raised_again():
+    work = """
+    import time, weakref
+    class Thing: pass
+    thing = Thing()
+    kept = weakref.ref(thing, lambda _: time.sleep(1.0))  # Python drops what is raised in it
+    interrupts.hold()
+    del thing
+    time.sleep(100)"""
+    code, out, err, seconds = run(work.strip(), signal.SIGINT)
+    assert (code, out) == (130, "saved\n")
+    assert "Traceback" not in err
+    assert seconds < 2.0 + BUSY
 
 
 def test_what_was_ignored_at_the_start_is_ignored():

@@ -99,7 +99,10 @@ def main(argv: list[str] | None = None) -> int:
     if argv is not None:
         return _guarded(argv)
     with interrupts.handled():
-        return _guarded(sys.argv[1:])
+        code = _guarded(sys.argv[1:])
+        if interrupts.asked():
+            interrupts.leave(code)
+    return code
 
 
 def _guarded(words: list[str]) -> int:

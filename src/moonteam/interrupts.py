@@ -10,21 +10,24 @@ takes no notice of a signal while a compiled program runs or XLA compiles, so a 
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 CODE = 130
 """Exit code of whatever was interrupted, by Ctrl-C or SIGTERM."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _GRACE = 0.5  # s in which the main thread may leave by itself
+_LAST = 5.0  # s for what is registered to be done at the end
 
 
 @dataclass
@@ -39,6 +42,8 @@ class _State:
     """Of the command that runs."""
 
     asked: int = 0  # signals so far
+    number: int = signal.SIGINT  # the last
+    sent: int = 0  # those of them that are our own
     held: bool = False  # work is done that is lost if the process leaves at once
     said: bool = False  # that it was interrupted
     stop: Stop | None = None  # who is told instead of interrupted, while something is held
@@ -54,9 +59,30 @@ def hold() -> None:
 
 def say() -> int:
     """Says that the command was interrupted; returns the exit code."""
-    print("moonteam: interrupted", file=sys.stderr)
     _now.said = True
+    with suppress(OSError):
+        print("moonteam: interrupted", file=sys.stderr, flush=True)
     return CODE
+
+
+def leave(code: int) -> NoReturn:
+    """Ends the process after a signal.
+
+    Python's own end waits for threads and programs that were left in the middle, without end.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):
+            stream.flush()
+    timer = threading.Timer(_LAST, os._exit, (code,))
+    timer.daemon = True
+    timer.start()
+    atexit._run_exitfuncs()
+    os._exit(code)
+
+
+def _write(text: str) -> None:
+    with suppress(OSError):  # nobody reads it any more
+        os.write(2, f"moonteam: {text}\n".encode())
 
 
 def asked() -> bool:
@@ -77,9 +103,12 @@ def handled() -> Iterator[None]:
     before = _answered()
     wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(reading, state), daemon=True).start()
+    hook = sys.unraisablehook
+    sys.unraisablehook = partial(_dropped, hook, state)
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         signal.set_wakeup_fd(wakeup)
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -117,24 +146,41 @@ def _answered() -> dict[signal.Signals, Any]:
 
 def _answer(number: int, frame: FrameType | None) -> None:
     """Python's part, on the main thread."""
-    _now.asked += 1
+    _now.asked, _now.number = _now.asked + 1, number
     if _now.stop is not None and _now.held and not _now.stop.asked:
         _now.stop.asked = True
         return
     raise KeyboardInterrupt
 
 
+def _dropped(hook: Callable[[Any], object], state: _State, what: Any) -> None:
+    """Sends the signal again where Python had to drop the exception: where an object ends."""
+    if what.exc_type is not KeyboardInterrupt:
+        hook(what)
+        return
+
+    def again() -> None:
+        state.sent += 1
+        signal.pthread_kill(threading.main_thread().ident or 0, state.number)
+
+    timer = threading.Timer(0.05, again)
+    timer.daemon = True
+    timer.start()
+
+
 def _watch(reading: int, state: _State) -> None:
     """The other part: a byte comes for each signal at once, whatever the main thread is at."""
-    came = 0
+    came = heard = 0
     while data := os.read(reading, 16):
         came += sum(byte in SIGNALS for byte in data)
-        if came == 1 and state.held:
-            os.write(2, b"moonteam: stopping; what runs is finished and saved, a second Ctrl-C "
-                        b"leaves at once\n")
-        elif came:
+        if came - state.sent <= heard:
+            continue
+        heard = came - state.sent
+        if heard == 1 and state.held:
+            _write("stopping; what runs is finished and saved, a second Ctrl-C leaves at once")
+        else:
             time.sleep(_GRACE)
             if not state.said:
-                os.write(2, b"moonteam: interrupted\n")
+                _write("interrupted")
             os._exit(CODE)
     os.close(reading)

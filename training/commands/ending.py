@@ -18,7 +18,7 @@ class Watched(RunFolder, Printed):
     """How a run is kept and watched."""
 
     checkpoint_seconds: Aside[float] = 30.0
-    """Seconds between two checkpoints; a chunk of updates is never cut."""
+    """Seconds from one checkpoint to the next, at most; a chunk of updates is never cut."""
     tensorboard: Aside[bool] = False
     """Write the metrics as TensorBoard events into the run folder too; needs
     pip install 'moonteam[tensorboard]'."""
@@ -44,7 +44,8 @@ class Taught(Seeded, Watched):
     """The same for imitation and refinement."""
 
     checkpoint_seconds: Aside[float] = 60.0
-    """Seconds between two checkpoints, which hold all labelled states; a round is never cut."""
+    """Seconds from one checkpoint to the next, at most; it holds all labelled states, and a round
+    is never cut."""
 
 
 def complete(run: Run, json: bool) -> int:

@@ -166,11 +166,13 @@ class Run:
             enough = stop_after is not None and position.total_updates >= stop_after
             if enough or anywhere(stop.asked):
                 return False
+            begun = time.monotonic()
             row = self._chunk()
             show(position.env_steps, self.trainee.words(self.metrics.rows))
             if self.stop_on_collapse:
                 self._check_standing()
-            due = time.monotonic() - self.last_saved > self.checkpoint_seconds
+            now = time.monotonic()  # another chunk would make it later than that
+            due = now - self.last_saved + (now - begun) > self.checkpoint_seconds
             ended = position.update >= updates
             if anywhere(due or ended or row is self.best()):
                 self.save()
