@@ -224,7 +224,8 @@ def resumed(tmp_path, words, keep):
 @pytest.mark.parametrize("more", [
     ("grid", str(GOLDEN), "--limit", "4", "--planner", "exact", "--planner", "greedy"),
     ("grid", "seconds/3x5-7", "--limit", "4", "--planner", "exact", "--planner", "greedy"),
-    ("sets", "2x3", "3x5", "--limit", "3", "--planner", "exact")])
+    ("sets", "2x3", "3x5", "--limit", "3", "--planner", "exact"),
+    ("replanning", "--count", "2", "--planner", "greedy")])
 def test_rows_that_are_done_are_not_done_again(tmp_path, capsys, more):
     whole, parts = (json.loads((folder / "report.json").read_text())
                     for folder in resumed(tmp_path, ["evaluate", *more], 5))

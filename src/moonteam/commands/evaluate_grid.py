@@ -141,7 +141,7 @@ def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
     if "interrupted" not in document:
         return 0
     left = ", ".join(document["interrupted"])
-    more = "; --resume goes on" if args.out and hasattr(args, "resume") else ""
+    more = "; --resume goes on" if args.out else ""
     print(f"moonteam: interrupted; the report lacks {left}{more}", file=sys.stderr)
     return interrupts.CODE
 

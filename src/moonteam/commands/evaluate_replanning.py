@@ -9,7 +9,7 @@ import tyro
 
 from moonteam import compilation
 from moonteam.commands.evaluate_grid import deliver, load_set, options_of
-from moonteam.commands.options import Drawn, Limited, Many, Reported
+from moonteam.commands.options import Drawn, Limited, Many, Reported, Resumable
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 
@@ -18,7 +18,7 @@ FILES = ("report.json", "summary.csv", "rows.csv", "table.md", "replanning.png")
 
 
 @dataclass(frozen=True)
-class Args(Drawn, Limited, Reported):
+class Args(Drawn, Limited, Resumable, Reported):
     """The paper's 5 + 5 experiment: each of the first five targets solved makes way for another.
 
     SET holds scenarios of ten targets, the last five of which appear later; without SET,
@@ -26,7 +26,9 @@ class Args(Drawn, Limited, Reported):
     targets in the same order. The exact planner, which plans anew whenever a target appears,
     is always there to compare with. Options marked "again" may be given several times.
 
-    Files in --out: report.json, summary.csv, rows.csv, table.md and replanning.png.
+    Files in --out: report.json, summary.csv, rows.csv, table.md and replanning.png; and rows.jsonl,
+    to which each plan is added as it is made (a policy's batch as a whole), so that --resume goes
+    on.
 
     Examples:
       moonteam evaluate replanning --count 200
@@ -76,13 +78,14 @@ def run(args: Args) -> int:
     compilation.enable_cache()
     from moonteam.evaluation import replanning
     from moonteam.evaluation.contenders import contenders
-    from moonteam.report import command
+    from moonteam.report import command, journal
 
     if any(text.startswith("best-of") for text in args.decode):
         raise InputError("--decode", "best-of-K looks ahead, which nobody can where targets "
                          "appear unannounced; argmax or sample")
     found, title = _scenarios(args)
     rows = contenders(options_of(args))
+    kept = journal.Kept.of(args.out, args.resume, command.figures(args))
     document = replanning.evaluate(found, rows, args.new, args.seed, title,
-                                   command.line("evaluate replanning", args))
+                                   command.line("evaluate replanning", args), kept)
     return deliver(args, document, replanning, "replanning.png")

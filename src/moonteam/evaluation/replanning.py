@@ -25,6 +25,7 @@ from moonteam.evaluation.metrics import Outcomes, Reference
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import MAX_TARGETS, ExactPlanner
 from moonteam.problem.scenario import Scenario
+from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.progress import track
 
 ORACLE = (("exact", "makespan"), ("exact", "moves"))
@@ -36,7 +37,7 @@ PANELS = (("makespan_gap", "T over exact(makespan), %", 100.0),
 
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], num_new: int, seed: int,
-             title: str, command: str) -> dict:
+             title: str, command: str, kept: Kept = NOTHING) -> dict:
     """The report; rows of the exact planner are added where they are missing.
 
     Raises:
@@ -55,7 +56,7 @@ def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], num_new: 
     ordered = [*oracle, *(row for row in rows if row.name not in names)]
     for contender in ordered:
         contender.check(world)
-    found = grid.run_all(ordered, world, least=len(ORACLE))
+    found = grid.run_all(ordered, world, least=len(ORACLE), kept=kept)
     document = grid.document(world.family, found, _reference(found), seed, title, command)
     document |= grid.missing(found, ordered)
     document["notes"].insert(0, _hindsight(scenarios))
