@@ -1,6 +1,8 @@
 """The exact planner by the clock, against everything tried."""
 
+import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -68,20 +70,28 @@ def test_the_plain_case_is_solved_the_same_either_way(instances, monkeypatch):
 
 
 def test_stopped_early_it_is_feasible_with_a_valid_bound(instances, monkeypatch):
-    monkeypatch.setattr(exact, "_TRIES", 1)
+    """By a clock that counts how often it is looked at; each time some teams later it goes on."""
+    ticks = itertools.count()
+    clock = SimpleNamespace(perf_counter=lambda: float(next(ticks)))
+    monkeypatch.setattr(exact, "_TRIES", 5)
+    monkeypatch.setattr(exact, "_SLICE", 1.0)
     seen = set()
-    for seed in range(12):
-        now = instances.large(seed, 3, 7, skills=2, most=1)
+    for seed in range(4):
+        now = instances.large(seed, 3, 9, skills=2, most=1)
         for objective in instances.OBJECTIVES:
             goal = (objective, 1.0, 0.3)
             best = instances.judged(now, ExactPlanner(*goal).plan(now))
-            early = ExactPlanner(*goal, time_limit=(1e-9, 1e-3)[seed % 2]).plan(now)
-            seen.add(early.status)
-            instances.judged(now, early)
             assert best.status == "optimal"
-            assert early.bound <= best.bound + 1e-6
-            assert value(*goal, early.makespan, early.effort) >= best.bound - 1e-6
-    assert "feasible" in seen
+            for looks in (1e-9, 20.0, 200.0, 1e9):
+                with monkeypatch.context() as patched:
+                    patched.setattr(exact, "time", clock)
+                    early = ExactPlanner(*goal, time_limit=looks).plan(now)
+                seen.add((early.status, looks, early.bound > 0))
+                instances.judged(now, early)
+                assert early.bound <= best.bound + 1e-6
+                assert value(*goal, early.makespan, early.effort) >= best.bound - 1e-6
+                assert early.status == "optimal" or looks < 1e9
+    assert {("feasible", 1e-9, False), ("feasible", 20.0, True), ("feasible", 200.0, True)} <= seen
 
 
 def test_from_the_middle_of_a_plan_what_remains_is_what_it_costs(instances):
