@@ -36,7 +36,7 @@ def test_a_folder_becomes_a_set(capsys, tmp_path, folder):
     assert "3 problems, 1 agents, 2 targets, 1 skills; 3 optima" in said
     assert "published, MILP: 3 problems, mean makespan 25.000" in said
     assert [one.id for one in timed.load_set(out)] == ["0", "2", "10"]
-    assert imported(folder, out, "--limit", "2", "--json") == 0
+    assert imported(folder, out, "--limit", "2", "--json", "--force") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["published"] == {"MILP": {"problems": 2, "mean": 22.0}}
     assert len(timed.load_set(out)) == 2
@@ -47,7 +47,7 @@ def test_a_set_is_written_whole_or_not_at_all(capsys, tmp_path, folder):
     out.write_text("what was there\n")
     broken = folder / "problem_instances" / "problem_instance_10.json"
     broken.write_text('{"Q": [[1]]}')
-    assert imported(folder, out) == 2
+    assert imported(folder, out, "--force") == 2
     assert "problem_instance_10.json" in capsys.readouterr().err
     assert out.read_text() == "what was there\n"
 
