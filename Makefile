@@ -18,7 +18,7 @@ test: $(STAMP)
 soak: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m soak --durations=15
 
-# 100,000 files that are almost right, in half an hour; says how many of each kind came out how.
+# 100,000 files that are almost right, in ten minutes; says how many of each kind came out how.
 fuzz: $(STAMP)
 	$(BIN)/python -m pytest -q -m soak tests/fuzz --durations=7
 

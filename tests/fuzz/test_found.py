@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -206,9 +207,9 @@ def test_a_policy_file_of_a_terabyte(tmp_path):
 
 @pytest.fixture
 def place(tmp_path):
-    """A checkpoint of three arrays and a key."""
-    states.seeds(tmp_path)
-    return tmp_path / "made" / "00000001"
+    """A checkpoint of three arrays and a key, in a folder of an odd name."""
+    states.seeds(tmp_path / "ü %41")
+    return tmp_path / "ü %41" / "made" / "00000001"
 
 
 def signed(place, **said):
@@ -219,11 +220,15 @@ def signed(place, **said):
     return place
 
 
+def test_a_right_checkpoint(place):
+    assert answer(lambda: states.read(signed(place))) == "read"
+
+
 def test_a_checkpoint_of_terabytes(place):
     """Its arrays are said to be zeros as far as they are not written."""
     import tensorstore as ts
 
-    store = ts.KvStore.open({"driver": "ocdbt", "base": f"file://{place}/learner/"}).result()
+    store = ts.KvStore.open({"driver": "ocdbt", "base": f"file://{quote(str(place))}/learner/"}).result()
     key = b"['params']['w']/.zarray"
     said = json.loads(store.read(key).result().value)
     said["shape"] = [10**13, 4]
