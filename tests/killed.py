@@ -47,4 +47,5 @@ def kill_when_saved(out, words, before="", kills=1):
         if (out / "report.json").exists():
             break
     assert done
+    print(f"{done} kills survived")
     return done
