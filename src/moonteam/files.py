@@ -20,7 +20,7 @@ from moonteam.strict import json_value
 T = TypeVar("T")
 
 _TOO_LONG = re.compile(r"Expected `\w+` of length <= (\d+)")
-
+_NOT_YAML = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
 
 MOST_BYTES = 128 << 20
 """Of a file of text."""
@@ -202,9 +202,13 @@ def write_json(path: str | os.PathLike[str], value: Any, indent: int = 2) -> Non
 
 
 def dump_json(value: Any, indent: int = 0) -> str:
-    """JSON text; not-a-number and infinity become null, NumPy scalars and arrays are plain."""
+    """JSON text; not-a-number and infinity become null, NumPy scalars and arrays are plain.
+
+    YAML reads it as the same: what it takes for the end of a line, or not at all, is escaped.
+    """
     data = msgspec.json.encode(value, enc_hook=_plain)
-    return (msgspec.json.format(data, indent=indent) if indent else data).decode()
+    text = (msgspec.json.format(data, indent=indent) if indent else data).decode()
+    return _NOT_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def _plain(value: Any) -> Any:

@@ -10,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 
-from moonteam import loading
+from moonteam import files, loading
 from moonteam.errors import InputError
 from moonteam.policies.policy import Policy
 from moonteam.terrain import dem
@@ -75,6 +75,16 @@ def test_missions(tmp_path, value, line):
     path = tmp_path / "m.yaml"
     path.write_text(json.dumps(value))
     assert line in refusal(loading.load, path)
+
+
+def test_a_mission_is_written_as_it_was_read(tmp_path):
+    """A name that YAML would take for two lines."""
+    odd = "a\x85b\u2028c\x7fd\ufeff"
+    (tmp_path / "m.yaml").write_text(json.dumps(DEMO | {"site": {"preset": odd}}))
+    found = loading.load(tmp_path / "m.yaml")
+    assert found.site.preset == odd
+    files.write_json(tmp_path / "again.yaml", found)
+    assert loading.load(tmp_path / "again.yaml") == found
 
 
 @pytest.mark.parametrize(("text", "line"), [
