@@ -34,7 +34,7 @@ _GREEDY = 5e-9  # s that the greedy plan takes, by targets squared and agents
 _AGAIN, _SMALL = 300, 16  # moves a target after which small ones are hot again; up to how many
 _RUN = 600  # moves by targets squared of one run, after which another begins anew
 _APART = 7919  # between the seeds of runs
-MIX = np.array([0.45, 0.5, 0.7, 0.95, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.25, 1.0])
+MIX = np.array([0.6, 0.65, 0.75, 0.95, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.3, 1.0])
 """Chances of the moves, added up, and their measures, see `annealing.anneal`; found by trying."""
 
 
