@@ -32,7 +32,7 @@ _SLICE = 0.002  # s between later looks
 _LAST = 4e-5  # s a target that it takes to write the plan down
 _GREEDY = 5e-9  # s that the greedy plan takes, by targets squared and agents
 _AGAIN, _SMALL = 300, 16  # moves a target after which small ones are hot again; up to how many
-_RUN = 600  # moves by targets squared of one run, after which another begins anew
+_RUN = 275  # moves by targets squared of one run, after which another begins anew
 _APART = 7919  # between the seeds of runs
 MIX = np.array([0.6, 0.65, 0.75, 0.95, 1.0, 0.5, 1.0, 0.0, 10.0, 0.0, 0.3, 1.0])
 """Chances of the moves, added up, and their measures, see `annealing.anneal`; found by trying."""
@@ -116,6 +116,17 @@ def first_plan(opened: Open, plan: annealing.Plan, space: annealing.Scratch,
     return float(space.result[0])
 
 
+def load(opened: Open, plan: annealing.Plan, space: annealing.Scratch, goal: annealing.Goal,
+         found: Best) -> float:
+    """Fills the plan with a list that was found; returns its cost."""
+    plan.order[:], plan.team[:], plan.size[:] = found.order, found.team, found.size
+    plan.place[found.order] = np.arange(len(found.order))
+    cost = annealing.decode(opened.work, plan, space, goal, 0, len(found.order), np.inf, 0.0, 0.0,
+                            0.0)
+    annealing.settle(opened.work, plan, space, 0)
+    return float(cost)
+
+
 def temperatures(count: int) -> tuple[float, float]:
     """In units, at the beginning and at the end; found by trying (DCMRTA and HeteroMRTA)."""
     if count <= _SMALL:
@@ -147,20 +158,32 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
 
 def _runs(opened: Open, alpha: float, beta: float, iterations: int | None, until: float, seed: int,
           stop: threading.Event) -> Best:
-    """Runs one after the other, each from the beginning, as long as there is time."""
+    """Runs of a set length, each from the beginning; in what is left, one goes on from the best."""
     count = len(opened.targets)
     most = _RUN * count**2 if count > _SMALL else None
-    found: list[Best] = []
-    done = 0
-    while True:
-        left = None if iterations is None else iterations - done
-        moves = left if most is None else most if left is None else min(most, left)
-        found.append(_run(opened, alpha, beta, moves, until, seed + _APART * len(found), stop))
-        done += found[-1].iterations
-        if (count == 0 or stop.is_set() or time.perf_counter() >= until
-                or (iterations is None and most is None)
-                or (iterations is not None and done >= iterations)):
-            return _merge(found)
+    moves = most if iterations is None else min(most or iterations, iterations)
+    first = _run(opened, alpha, beta, moves, until, seed, stop)
+    found = [first]
+    if most is None or count == 0:
+        return first
+
+    def left() -> tuple[float, int | None]:
+        """How many more runs there is time for, and moves."""
+        if stop.is_set():
+            return 0.0, 0
+        by_time = (until - time.perf_counter()) / max(first.seconds, 1e-9)
+        if iterations is None:
+            return by_time, None
+        rest = iterations - sum(one.iterations for one in found)
+        return min(by_time, rest / most), rest
+
+    while left()[0] >= 2.0:
+        found.append(_run(opened, alpha, beta, most, until, seed + _APART * len(found), stop))
+    runs, moves = left()
+    if runs > 0.0:
+        found.append(_run(opened, alpha, beta, moves, until, seed + _APART * len(found), stop,
+                          _merge(found)))
+    return _merge(found)
 
 
 def _merge(found: list[Best], together: bool = False) -> Best:
@@ -181,16 +204,20 @@ def _merge(found: list[Best], together: bool = False) -> Best:
 
 
 def _run(opened: Open, alpha: float, beta: float, iterations: int | None, until: float, seed: int,
-         stop: threading.Event) -> Best:
-    """One run, cooled down over its moves or its time."""
+         stop: threading.Event, begin: Best | None = None) -> Best:
+    """One run, cooled down over its moves or its time; from a list it begins less hot."""
     began = time.perf_counter()
     work = opened.work
     plan, space = space_for(work)
     goal, unit = steering(work, alpha, beta)
     true = annealing.Goal(alpha, beta, 0.0, goal.fine)
-    now = first_plan(opened, plan, space, goal, until)
-    result = space.result
     hot, cold = temperatures(len(plan.order))
+    if begin is None:
+        now = first_plan(opened, plan, space, goal, until)
+    else:
+        now = load(opened, plan, space, goal, begin)
+        hot, cold = 0.6 * hot, 0.8 * cold
+    result = space.result
     best = np.array([alpha * result[1] + beta * result[2] + true.fine * result[3], *result[1:]])
     order, team, size = plan.order.copy(), plan.team.copy(), plan.size.copy()
     curve = [(time.perf_counter() - began, float(best[0]))]
