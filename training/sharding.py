@@ -37,6 +37,12 @@ def use_all_cores() -> None:
         return  # somebody computed before: keep the devices there are
 
 
+def devices_here() -> int:
+    """JAX devices that `use_all_cores` makes, or leaves."""
+    asked = os.environ.get("JAX_NUM_CPU_DEVICES", "")
+    return int(asked) if asked.isdecimal() and int(asked) else cores()
+
+
 def join(coordinator: str, processes: int, process: int) -> None:
     """Makes this process one of several that train together, before anything is computed.
 

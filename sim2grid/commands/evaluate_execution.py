@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
-from moonteam.commands.options import Missions, Planning, Reported, Resumable
+from moonteam.cluster import Cluster, cluster
+from moonteam.commands.options import Apart, Missions, Planning, Reported, Resumable
 from moonteam.report import command, journal
 from moonteam.report.command import Aside
 from moonteam.report.journal import Journal
@@ -24,7 +25,7 @@ FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", 
 
 
 @dataclass(frozen=True)
-class Args(Planning, Missions, Resumable, Reported):
+class Args(Planning, Missions, Apart, Resumable, Reported):
     """Execute random missions in physics and compare what they cost with the grid's promise.
 
     Each mission has one robot of each of our own kinds with random skills, random targets
@@ -44,6 +45,7 @@ class Args(Planning, Missions, Resumable, Reported):
       moonteam evaluate execution --site flat --count 8 --lose 1 --out runs/lose --resume
       moonteam evaluate execution --backend native mjx --count 10 --out runs/backends
       moonteam evaluate execution --count 20 --new-targets 5 --slow 0.5 --silent 0.5 --json
+      moonteam evaluate execution --count 500 --on ray://head:10001 --out runs/many
     """
 
     site: tuple[Literal["mare", "highland", "crater_rim", "polar", "flat"], ...] = ("mare",)
@@ -78,12 +80,18 @@ class Args(Planning, Missions, Resumable, Reported):
     width: int = 25
     """Worlds that the engine advances together."""
     threads: Aside[int] = 0
-    """CPU threads of the native engine, 0 for all; the report is the same."""
+    """CPU threads of the native engine, 0 for all; the report is the same. With --on each piece
+    has one."""
 
 
 def run(args: Args) -> int:
     """Evaluates, prints, saves."""
     _check(args)
+    with cluster(args.on, at_once=True) as workers:
+        return _run(args, workers)
+
+
+def _run(args: Args, workers: Cluster | None) -> int:
     from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
@@ -93,6 +101,7 @@ def run(args: Args) -> int:
     from sim2grid.study.summary import document
 
     evaluation = _evaluation(args)
+    evaluation.cluster = workers
     if args.out:
         held = Journal[Row](args.out, args.resume, _options(args), Row, FILES)
         evaluation.rows |= {(row.contender, row.number): row for row in held.entries}

@@ -12,15 +12,16 @@ In mode `clock` a decision is a target, and the planner plans in seconds over th
 (see `sim2grid.clock`); the loop is closed, and who decides is a planner by the clock.
 
 Missions keep row and number of rows of the engine however they are run, so that each can be
-repeated alone to the bit. Legend: F missions of a fleet, B rows of the engine.
+repeated alone to the bit, and in a worker of a cluster. Legend: F missions of a fleet, B rows of
+the engine.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -28,6 +29,7 @@ import msgspec
 import numpy as np
 
 from moonteam import interrupts
+from moonteam.cluster import Cluster
 from moonteam.errors import InputError
 from moonteam.physics.backends import MjxBackend
 from moonteam.planners import registry
@@ -177,6 +179,7 @@ class Evaluation:
     rows: dict[tuple[str, int], Row] = field(default_factory=dict)
     entries: list[Entry] = field(default_factory=list)
     label: str = ""  # before what the progress bar is called
+    cluster: Cluster | None = None  # where missions are run; None: in this process
 
     def run(self) -> None:
         """Runs what is not done yet. Raises InputError before a mission that cannot be run."""
@@ -185,8 +188,43 @@ class Evaluation:
         for index, fleet in enumerate(fleets):
             self.entries += [Entry(index * self.count + k, fleet.draws[k], mission)
                              for k, mission in enumerate(fleet.missions)]
+        if self.cluster is not None:
+            self._run_on(self.cluster)
+            return
         for index, fleet in enumerate(fleets):
             Group(self, fleet, index * self.count).run()
+
+    def todo(self, contender: Contender, first: int) -> list[int]:
+        """Numbers, within a site's missions of which `first` is the first, that have no row yet."""
+        return [k for k in range(self.count) if (contender.name, first + k) not in self.rows]
+
+    def _run_on(self, cluster: Cluster) -> None:
+        sites = [(recipe, index * self.count) for index, recipe in enumerate(self.recipes)]
+        pieces = [(recipe, first, self.count, self.seed, self.width, contender, part)
+                  for recipe, first in sites for contender in self.contenders
+                  for part in self._cut(contender, self.todo(contender, first), cluster)]
+        left = sum(len(part) for *_, part in pieces)
+        total = len(self.recipes) * len(self.contenders) * self.count
+        with bar(f"{self.label}on {cluster.name}", total, total - left) as update:
+            for _, rows in cluster.done(played, pieces):
+                for row in rows:
+                    self.add(row)
+                left -= len(rows)
+                update(total - left, f"{total - left} of {total} missions")
+
+    def _cut(self, contender: Contender, todo: list[int], cluster: Cluster) -> list[list[int]]:
+        """Pieces of work: some missions, or on an accelerator's engine all that it holds at once,
+        whose program costs the same however many of its rows are idle.
+        """
+        whole = contender.backend != "native" and contender.loop != "grid"
+        size = self.width if whole else cluster.size(self.count)
+        return [list(part) for _, part in itertools.groupby(todo, lambda k: k // size)]
+
+    def add(self, row: Row) -> None:
+        """Keeps what is done."""
+        self.rows[row.contender, row.number] = row
+        interrupts.hold()
+        self.keep(row)
 
     def _check_fused(self) -> None:
         """Raises InputError for what the fused program cannot run, before anything is."""
@@ -213,36 +251,36 @@ class Group:
         self._height = ground_height(fleet.site.heights, fleet.site.spacing)
         self._width = min(evaluation.width, len(fleet.missions))
         self._engines: dict[str, Backend] = {}
-        self._plans: dict[tuple, list[OnGrid]] = {}
+        self._plans: dict[tuple, dict[int, OnGrid]] = {}
 
     def run(self) -> None:
         """All contenders."""
         for contender in self._all.contenders:
-            todo = [k for k in range(len(self._fleet.missions))
-                    if (contender.name, self._first + k) not in self._all.rows]
-            if todo:
-                self._run(contender, todo)
+            if todo := self._all.todo(contender, self._first):
+                self.play(contender, todo)
 
-    def _run(self, contender: Contender, todo: list[int]) -> None:
+    def play(self, contender: Contender, todo: list[int]) -> None:
+        """Some missions by one contender."""
         if contender.mode == "clock":
             self._drive(contender, todo, [self._by_the_clock(contender, k) for k in todo],
-                        self._promises(contender))
+                        self._promises(contender, todo))
             return
         make = maker(contender)
-        grid = self._on_grid(contender, make)
+        grid = self._on_grid(contender, make, todo)
         if contender.loop == "grid":
             for k in todo:
                 self._keep(contender, k, grid[k].report, grid[k].nominal_s)
             return
-        routes: list[Route | None] = [None] * len(grid)
+        blind: dict[int, OnGrid] = {}
         if contender.loop == "open":
-            routes = [plan.route for plan in self._on_grid(contender, make, events=False)]
+            blind = self._on_grid(contender, make, todo, events=False)
+        routes = {k: plan.route for k, plan in blind.items()}
         self._drive(contender, todo,
-                    [self._execution(contender, make, k, routes[k]) for k in todo], grid)
+                    [self._execution(contender, make, k, routes.get(k)) for k in todo], grid)
 
     def _drive(self, contender: Contender, todo: list[int],
                executions: Sequence[Execution | TimedExecution],
-               promised: Sequence[Promise]) -> None:
+               promised: Mapping[int, Promise]) -> None:
         """Runs missions in physics and keeps their rows."""
         done = len(self._fleet.missions) - len(todo)
         total = len(self._fleet.missions)
@@ -296,17 +334,17 @@ class Group:
         fleet = self._fleet
         return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds))
 
-    def _promises(self, contender: Contender) -> list[Promise]:
+    def _promises(self, contender: Contender, todo: Iterable[int]) -> dict[int, Promise]:
         """What a planner by the clock makes of each mission at its start, ways alone counted."""
-        found = []
-        for k in range(len(self._fleet.missions)):
+        found = {}
+        for k in todo:
             execution = self._by_the_clock(contender, k, settling=False)
             execution.start(self._fleet.starts[k])
             assert execution.question is not None
             execution.planner.act(execution.question)
             plan = cast(Keeper, execution.planner).plan
             expected = None if plan is None or plan.makespan is None else plan.makespan / MS
-            found.append(Promise(None, expected))
+            found[k] = Promise(None, expected)
         return found
 
     def _seed(self, k: int) -> int:
@@ -329,34 +367,62 @@ class Group:
         row = Row(number=self._first + k, contender=contender.name, site=recipe.preset or "",
                   site_seed=recipe.seed, seed=report.seed, slot=k % self._width,
                   solvable=not by_event, nominal_s=nominal_s, report=report)
-        self._all.rows[contender.name, row.number] = row
-        interrupts.hold()
-        self._all.keep(row)
+        self._all.add(row)
 
-    def _on_grid(self, contender: Contender, make: Callable[[], Planner],
-                 events: bool = True) -> list[OnGrid]:
-        """The missions on the grid alone, kept for the other contenders of that planner."""
+    def _on_grid(self, contender: Contender, make: Callable[[], Planner], todo: Sequence[int],
+                 events: bool = True) -> dict[int, OnGrid]:
+        """Missions on the grid alone, kept for the other contenders of that planner."""
         events = events and any(mission.events for mission in self._fleet.missions)
-        key = (contender.who, contender.objective, events)
-        if key not in self._plans:
-            seeds = [self._seed(k) for k in range(len(self._fleet.missions))]
-            self._plans[key] = on_grid(self._fleet, make, events, seeds)
-        return self._plans[key]
+        held = self._plans.setdefault((contender.who, contender.objective, events), {})
+        if new := {k: self._seed(k) for k in todo if k not in held}:
+            held |= on_grid(self._fleet, make, events, new)
+        return held
 
 
-def on_grid(fleet: Fleet, make: Callable[[], Planner], events: bool, seeds: Sequence[int]
-            ) -> list[OnGrid]:
-    """What a planner makes of a fleet's missions without physics, with or without events."""
+@cache
+def _group(recipe: Recipe, first: int, count: int, seed: int, width: int
+           ) -> tuple[Evaluation, Group]:
+    """In a worker: a site's missions, kept with their engines for the pieces to come."""
+    whole = Evaluation([recipe], count, [], seed, width, threads=1)
+    return whole, Group(whole, make_fleet(recipe, count), first)
+
+
+def played(recipe: Recipe, first: int, count: int, seed: int, width: int, contender: Contender,
+           todo: list[int]) -> list[Row]:
+    """The rows of some missions by one contender, a pure function of all these.
+
+    Args:
+      recipe: of the site's missions.
+      first: number of the first of them in the report.
+      count: of them.
+      seed: of the report.
+      width: rows of the engine.
+      contender: who decides.
+      todo: which of them, 0 to count - 1.
+    """
+    whole, group = _group(recipe, first, count, seed, width)
+    group.play(contender, todo)
+    return [whole.rows.pop((contender.name, first + k)) for k in todo]
+
+
+def on_grid(fleet: Fleet, make: Callable[[], Planner], events: bool, seeds: Mapping[int, int]
+            ) -> dict[int, OnGrid]:
+    """What a planner makes of a fleet's missions without physics, with or without events.
+
+    `seeds` gives the missions, by number, each with the planner's seed.
+    """
     bodies, rules = ideal_bodies(fleet.bodies), Rules()
     executions = []
-    for k, mission in enumerate(fleet.missions):
+    for k, seed in seeds.items():
+        mission = fleet.missions[k]
         spec = mission if events else msgspec.structs.replace(mission, events=())
         executions.append(Execution(spec, fleet.scenarios[k], make(), bodies, fleet.frame,
-                                    seed=seeds[k], rules=rules))
-    starts = np.stack([ideal_start(fleet.frame, [r.cell for r in mission.robots])
-                       for mission in fleet.missions])
+                                    seed=seed, rules=rules))
+    starts = np.stack([ideal_start(fleet.frame, [r.cell for r in fleet.missions[k].robots])
+                       for k in seeds])
     run(executions, IdealBackend(rules.chunk_steps), starts)
-    return [_ideal(fleet, k, execution, bodies) for k, execution in enumerate(executions)]
+    return {k: _ideal(fleet, k, execution, bodies)
+            for k, execution in zip(seeds, executions, strict=True)}
 
 
 def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) -> OnGrid:

@@ -76,10 +76,10 @@ def restage(report: dict[str, Any], number: int, source: object,
     prepared = prepare(mission, source)
     make = maker(chosen)
     fleet = fleet_of([mission], [1], prepared.site, prepared.passable)
-    grid = on_grid(fleet, make, events=True, seeds=[row.seed])[0]
+    grid = on_grid(fleet, make, events=True, seeds={0: row.seed})[0]
     route = None
     if chosen.loop == "open":
-        route = on_grid(fleet, make, events=False, seeds=[row.seed])[0].route
+        route = on_grid(fleet, make, events=False, seeds={0: row.seed})[0].route
     execution = Execution(mission, prepared.scenario, make(), prepared.bodies, prepared.frame,
                           seed=row.seed, mode=chosen.mode, route=route)
     return Staged(chosen, prepared, execution, grid.plan, row, width)

@@ -157,6 +157,12 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Writes bytes, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
 def read_json(path: str | os.PathLike[str], kind: Any = Any) -> Any:
     """The value of a JSON file, checked against a type. Raises InputError."""
     return convert(json_value(read_text(path), path), kind, path)

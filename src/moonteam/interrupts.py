@@ -136,6 +136,18 @@ def postponed() -> Iterator[Stop]:
         _now = outer
 
 
+@contextmanager
+def kept() -> Iterator[None]:
+    """Whatever a library does inside it, signals are answered afterwards as before."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
 def _answered() -> dict[signal.Signals, Any]:
     """Answers the signals that are not ignored, as those of a job in the background are; returns
     what answered them before.

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from moonteam import files, interrupts, outputs
 from moonteam.commands.options import Printed, RunFolder, Seeded
 from moonteam.report.command import Aside
 from training.run.machine import FILES, Diverged, Run
+from training.sharding import join, use_all_cores
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,31 @@ class Watched(RunFolder, Printed):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Together:
+    """Several processes that train as one."""
+
+    coordinator: str = ""
+    """host:port of process 0, to train on several hosts; each runs this command."""
+    processes: int = 1
+    """Processes that train together."""
+    process: int = 0
+    """Number of this one, from 0; others than 0 write to OUT/process-N."""
+
+    def join(self) -> None:
+        """Makes all cores devices and meets the other processes, if there are to be any.
+
+        Raises InputError if they do not come together.
+        """
+        use_all_cores()
+        if self.coordinator:
+            join(self.coordinator, self.processes, self.process)
+
+    def own(self, out: Path) -> Path:
+        """The folder that this process writes to."""
+        return out / f"process-{self.process}" if self.coordinator and self.process else out
+
+
+@dataclass(frozen=True, kw_only=True)
 class Taught(Seeded, Watched):
     """The same for imitation and refinement."""
 
@@ -62,13 +90,24 @@ def complete(run: Run, json: bool) -> int:
         print(f"moonteam: {error}", file=sys.stderr)
         return 1
     if not finished:
-        print(f"moonteam: interrupted after {run.trainee.unit} {run.position.total_updates}, "
-              f"saved; go on with --out {run.out} --resume", file=sys.stderr)
-        return interrupts.CODE
+        return interrupted(run.trainee.unit, run.position.total_updates, run.out)
     report = run.finish()
+    shown = report | {"out": str(run.out), "config": run.trainee.recipe}
+    return ended(shown, run.trainee.lines(report), run.out, json)
+
+
+def interrupted(unit: str, updates: int, out: Path) -> int:
+    """Says where a run stands that was stopped; returns the exit code."""
+    print(f"moonteam: interrupted after {unit} {updates}, saved; go on with --out {out} --resume",
+          file=sys.stderr)
+    return interrupts.CODE
+
+
+def ended(report: dict[str, Any], lines: Sequence[str], out: Path, json: bool) -> int:
+    """Prints what a run came to; returns the exit code."""
     if json:
-        print(files.dump_json(report | {"out": str(run.out), "config": run.trainee.recipe}))
-    *lines, spent = run.trainee.lines(report)
-    print(*lines, f"{spent}; policy, curve and report in {run.out}", sep="\n",
+        print(files.dump_json(report))
+    *before, spent = lines
+    print(*before, f"{spent}; policy, curve and report in {out}", sep="\n",
           file=sys.stderr if json else sys.stdout)
     return 0

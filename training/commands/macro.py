@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from moonteam import outputs, paths
+from moonteam import interrupts, outputs, paths
+from moonteam.cluster import cluster
+from moonteam.commands.options import Apart
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.progress import say
-from training.commands.ending import Watched, complete
+from training.commands.ending import Together, Watched, complete, ended, interrupted
 from training.mappo.macro import config as configs
 from training.mappo.macro.config import MacroConfig
+from training.run.away import Stretch
 from training.run.machine import Run
-from training.sharding import use_all_cores
+from training.sharding import devices_here
 
 
 @dataclass(frozen=True)
-class Args(Watched):
+class Args(Together, Apart, Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
     on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one).
 
@@ -32,6 +37,7 @@ class Args(Watched):
       moonteam train quick
       moonteam train paper_team --seed 1 --out runs/team-1
       moonteam train paper_team --seeds 0 1 2 --out runs/team
+      moonteam train paper_team --seeds 0 1 2 --out runs/team --on ray://head:10001
       moonteam train any_team --out runs/any --resume
       moonteam train any_team --policy any_team --lr 3e-4 --rounds 300 --out runs/further
     """
@@ -39,7 +45,8 @@ class Args(Watched):
     config: Annotated[MacroConfig, tyro.conf.arg(name="")]
     """The run's numbers, from the preset."""
     seeds: tuple[int, ...] = ()
-    """Several runs one after the other, each in OUT/SEED, then put side by side in OUT."""
+    """Several runs one after the other, or side by side with --on, each in OUT/SEED, then put side
+    by side in OUT."""
     policy: str = ""
     """Policy file (.safetensors) or the name of a bundled policy, of kind pointer, to go on from
     instead of fresh weights."""
@@ -53,43 +60,79 @@ def parse(words: list[str]) -> Args:
 
 def run(args: Args) -> int:
     """Trains; returns the exit code."""
-    if not args.seeds:
-        return _train(args)
     if len(set(args.seeds)) < len(args.seeds):
         raise InputError("--seeds", f"{' '.join(map(str, args.seeds))}: a seed is given twice")
+    for option, given in (("--coordinator", args.coordinator), ("--tensorboard", args.tensorboard)):
+        if args.on and given:
+            raise InputError(option, "is for runs in this process, not for those --on a cluster")
+    if not args.seeds:
+        return _train_each(args, [args])
     from training.commands import compare
 
     base = args.out or args.folder(args.config.macro, args.seeds[0]).parent / args.config.macro
+    outs = [base / str(seed) for seed in args.seeds]
+    runs = [dataclasses.replace(args, out=out, resume=args.resume and out.exists(),
+                                config=dataclasses.replace(args.config, seed=seed))
+            for seed, out in zip(args.seeds, outs, strict=True)]
+    if args.process:
+        return _train_each(args, runs)
     with outputs.folder(base, compare.FILES, force=args.force, resume=args.resume):
-        return _train_all(args, base)
+        return _train_each(args, runs) or compare.run(compare.Args(tuple(outs), out=base))
 
 
-def _train_all(args: Args, base: Path) -> int:
-    from training.commands import compare
-
-    for seed in args.seeds:
-        out = base / str(seed)
-        one = dataclasses.replace(args, seeds=(), out=out, resume=args.resume and out.exists(),
-                                  config=dataclasses.replace(args.config, seed=seed))
-        if code := _train(one):
-            return code
-    return compare.run(compare.Args(tuple(base / str(seed) for seed in args.seeds), out=base))
+def _train_each(args: Args, runs: list[Args]) -> int:
+    if args.on:
+        return _train_apart(args.on, runs)
+    args.join()
+    return next((code for one in runs if (code := _train(one))), 0)
 
 
 def _train(args: Args) -> int:
+    """One run, in this process."""
     from training.mappo.macro.trainee import MacroMappo
 
-    use_all_cores()
-    config, params = args.config, None
-    if args.policy:
-        spec, params = _pointer(args.policy)
-        config = dataclasses.replace(config, spec=spec)
-    out = args.folder(config.macro, config.seed)
+    out = args.own(args.folder(args.config.macro, args.config.seed))
+    numbers = _numbers(args)
     with args.holding(out):
         say("moonteam: making grounds and held-out problems, compiling")
-        trainee = MacroMappo(config, params, args.policy)
-        return complete(Run(trainee, out, args.resume, args.checkpoint_seconds,
+        return complete(Run(MacroMappo(*numbers), out, args.resume, args.checkpoint_seconds,
                             tensorboard=args.tensorboard, force=args.force), args.json)
+
+
+def _train_apart(on: str, runs: list[Args]) -> int:
+    """Runs side by side on a cluster."""
+    from training.mappo.macro.trainee import MacroMappo
+    from training.run import away
+
+    outs = [one.folder(one.config.macro, one.config.seed) for one in runs]
+    keeping = [away.Keeping(one.resume, one.checkpoint_seconds, one.force) for one in runs]
+    numbers = [_numbers(one) for one in runs]
+    with contextlib.ExitStack() as stack:
+        workers = stack.enter_context(cluster(on))
+        assert workers is not None
+        for one, out in zip(runs, outs, strict=True):
+            stack.enter_context(one.holding(out))
+        stop = stack.enter_context(interrupts.postponed())
+        found = away.train(workers, MacroMappo, numbers, outs, keeping, devices_here(), stop)
+    return max(_end(known, out, runs[0].json) for known, out in zip(found, outs, strict=True))
+
+
+def _end(known: Stretch | None, out: Path, json: bool) -> int:
+    """Says what a run on a cluster came to; returns the exit code."""
+    if known is not None and known.failed:
+        print(f"moonteam: {known.failed}", file=sys.stderr)
+        return 1
+    if known is None or known.report is None:
+        return interrupted("round", known.updates if known else 0, out)
+    return ended(known.report, known.lines, out, json)
+
+
+def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
+    """What a run is made from: numbers, weights to go on from if any, and where these are from."""
+    if not args.policy:
+        return args.config, None, ""
+    spec, params = _pointer(args.policy)
+    return dataclasses.replace(args.config, spec=spec), params, args.policy
 
 
 def _pointer(name: str) -> tuple[Any, Any]:

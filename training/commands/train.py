@@ -13,7 +13,7 @@ from moonteam import files
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.command import Aside
-from training.commands.ending import Watched, complete
+from training.commands.ending import Together, Watched, complete
 from training.mappo import config as configs
 from training.mappo.config import Config
 
@@ -35,7 +35,7 @@ NAMES = (*MACRO, f"{IMITATE} quick", f"{IMITATE} any_team", REFINE)
 
 
 @dataclass(frozen=True)
-class Args(Watched):
+class Args(Together, Watched):
     """Train a grid policy from a preset.
 
     quick, paper_team, any_team: MAPPO from scratch, a target a decision, for teams of any size
@@ -65,12 +65,6 @@ class Args(Watched):
     stop_on_collapse: bool = True
     """Stop, with exit code 1, when held-out success has fallen to half of its best for three
     evaluations in a row."""
-    coordinator: str = ""
-    """host:port of process 0, to train on several hosts; each runs this command."""
-    processes: int = 1
-    """Processes that train together."""
-    process: int = 0
-    """Number of this one, from 0; others than 0 write to OUT/process-N."""
     dry_run: Aside[bool] = False
     """Print the numbers, totals, memory and work, train nothing."""
     compiled: Aside[bool] = False
@@ -126,17 +120,12 @@ def folder(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) 
 
 
 def _train(args: Args) -> int:
-    from training import sharding
     from training.mappo.trainee import Mappo
     from training.run.machine import Run
 
-    config = args.config
-    out = folder(args)
-    sharding.use_all_cores()
-    if args.coordinator:
-        sharding.join(args.coordinator, args.processes, args.process)
-        out = out / f"process-{args.process}" if args.process else out
+    out = args.own(folder(args))
+    args.join()
     with args.holding(out):
-        return complete(Run(Mappo(config), out, args.resume, args.checkpoint_seconds,
+        return complete(Run(Mappo(args.config), out, args.resume, args.checkpoint_seconds,
                             args.stop_on_collapse, args.tensorboard, args.begin, args.force),
                         args.json)

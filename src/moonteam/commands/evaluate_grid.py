@@ -11,7 +11,8 @@ from typing import Any
 import tyro
 
 from moonteam import compilation, interrupts, loading, paths
-from moonteam.commands.options import Drawn, Limited, Many, Reported, Resumable
+from moonteam.cluster import Cluster, cluster
+from moonteam.commands.options import Apart, Drawn, Limited, Many, Reported, Resumable
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
@@ -23,7 +24,7 @@ FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", 
 
 
 @dataclass(frozen=True)
-class Args(Drawn, Limited, Resumable, Reported):
+class Args(Drawn, Limited, Apart, Resumable, Reported):
     """Play a set of scenarios with any number of planners and compare them with the optimum.
 
     One row a planner and objective, or a policy and decoding: success, slack metrics and
@@ -46,6 +47,7 @@ class Args(Drawn, Limited, Resumable, Reported):
       moonteam evaluate grid 8x40 --planner lns --time-limit 0.01 --time-limit 0.1 --limit 20
       moonteam evaluate grid --count 500 --targets 3 --side 8 --max-steps 48 --planner policy
       --policy small --decode argmax --decode best-of-16
+      moonteam evaluate grid 8x40 --planner lns --planner cpsat --on ray
     """
 
     set: tyro.conf.Positional[str | None] = None
@@ -152,22 +154,25 @@ def run(args: Args) -> int:
     from moonteam.report import command, journal
 
     found, title = _scenarios(args)
-    options = options_of(args)
-    kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
-    document, form = judged(found, options, args.seed, title, command.line("evaluate grid", args),
-                            kept)
+    with cluster(args.on) as workers:
+        options = options_of(args)
+        kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
+        document, form = judged(found, options, args.seed, title,
+                                command.line("evaluate grid", args), kept, workers)
     return deliver(args, document, form, "gaps.png")
 
 
 def judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str,
-           line: str, kept: Kept = NOTHING) -> tuple[dict, Any]:
+           line: str, kept: Kept = NOTHING, workers: Cluster | None = None) -> tuple[dict, Any]:
     """The report on scenarios in steps or by the clock, and the module that says its form."""
     from moonteam.evaluation import contenders, grid, timed
 
     clocked = [one for one in found if isinstance(one, Timed)]
     if clocked:
-        return timed.evaluate(clocked, timed.contenders(options), seed, title, line, kept), timed
+        return timed.evaluate(clocked, timed.contenders(options), seed, title, line, kept,
+                              workers), timed
     if options.threads > 1:
         raise InputError("--threads", "is for sets by the clock")
     steps = [one for one in found if isinstance(one, Scenario)]
-    return grid.evaluate(steps, contenders.contenders(options), seed, title, line, kept), grid
+    return grid.evaluate(steps, contenders.contenders(options), seed, title, line, kept,
+                         workers), grid

@@ -117,6 +117,16 @@ class RunFolder(Resumable, Forced):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Apart:
+    """Where the work is done."""
+
+    on: Aside[str] = ""
+    """Compute on a Ray cluster: ray (the cores of this machine), HOST:PORT of a cluster that this
+    machine is part of, or ray://HOST:PORT; needs pip install 'moonteam[ray]'. Without it, in this
+    process. See docs/cluster.md."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Limited:
     """The beginning of a set."""
 

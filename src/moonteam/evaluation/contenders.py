@@ -13,6 +13,7 @@ import numpy as np
 
 from moonteam import paths
 from moonteam.errors import InputError
+from moonteam.evaluation.apart import Part, chunks
 from moonteam.evaluation.metrics import Outcomes
 from moonteam.evaluation.played import play
 from moonteam.evaluation.world import World, play_plans, snapshots, tally
@@ -83,6 +84,12 @@ class Contender(Protocol):
         """Plans and plays every scenario; what is planned is noted in `kept`, or taken from it."""
         ...
 
+    def parts(self, world: World, size: int, kept: Kept) -> list[Part]:
+        """What `run` would note and is not in `kept` yet, to be made apart, with at most `size`
+        scenarios to plan one by one in each part.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class Planned:
@@ -120,6 +127,18 @@ class Planned:
 
         walk = play_plans(world, plan)
         return Outcomes(self.name, *tally(world, walk), spent, first_call)
+
+    def parts(self, world: World, size: int, kept: Kept) -> list[Part]:
+        """See `Contender`; no target may appear under way."""
+        moments, own = snapshots(world, world.start), kept.within(self.name, "0")
+        left = [i for i in np.flatnonzero(~np.asarray(world.start.done)).tolist()
+                if not own.has(str(i))]
+        return [Part([(self.name, "0", str(i)) for i in some], self._apart,
+                     ([moments[i] for i in some],)) for some in chunks(left, size)]
+
+    def _apart(self, moments: list[Snapshot]) -> list[Timed]:
+        self._actions(moments[0])  # what is loaded or compiled at the first call
+        return [self._timed(moment) for moment in moments]
 
     def _plan_all(self, moments: list[Snapshot], over: BoolArray, title: str, round_: int,
                   kept: Kept) -> tuple[list[IntArray], list[float]]:
@@ -198,6 +217,13 @@ class Learned:
                     + note)
         return Outcomes(self.name, played.success, steps, played.moves, played.seconds,
                         played.compiling, note)
+
+    def parts(self, world: World, size: int, kept: Kept) -> list[Part]:
+        """See `Contender`; one, for the whole set is one batch."""
+        return [] if kept.has(self.name) else [Part([(self.name,)], self._apart, (world,))]
+
+    def _apart(self, world: World) -> list[dict[str, Any]]:
+        return [vars(self._run(world))]
 
 
 def contenders(options: Options) -> list[Contender]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from moonteam import interrupts
-from moonteam.evaluation import metrics, optima
+from moonteam.cluster import Cluster
+from moonteam.evaluation import apart, metrics, optima
 from moonteam.evaluation import world as worlds
 from moonteam.evaluation.contenders import Contender
 from moonteam.evaluation.world import World
@@ -23,8 +24,9 @@ PAGE = tuple(c for c in COLUMNS if c.key not in ("M_st", "M_tte", "decisions"))
 
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int, title: str,
-             command: str, kept: Kept = NOTHING) -> dict:
-    """The whole report as a JSON-able document; `kept` holds what was done before.
+             command: str, kept: Kept = NOTHING, cluster: Cluster | None = None) -> dict:
+    """The whole report as a JSON-able document, of work done here or on a cluster; `kept` holds
+    what was done before.
 
     Raises InputError before anything is run. Interrupted, it reports the rows that are done
     (see `run_all`).
@@ -32,7 +34,12 @@ def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int
     world = worlds.build(scenarios)
     for contender in rows:
         contender.check(world)
-    found = run_all(rows, world, kept=kept)
+    whole = list(rows)
+    if cluster is not None:
+        size = cluster.size(len(world))
+        count, kept = apart.done(cluster, [row.parts(world, size, kept) for row in rows], kept)
+        whole = whole[:count]
+    found = run_all(whole, world, kept=kept)
     reference = optima.reference(world.scenarios)
     return document(world.family, found, reference, seed, title, command) | missing(found, rows)
 

@@ -10,7 +10,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from moonteam.cluster import Cluster
 from moonteam.errors import InputError
+from moonteam.evaluation import apart
 from moonteam.evaluation.contenders import MAKESPAN, Options, policies
 from moonteam.planners.base import Objective, check_objective
 from moonteam.planners.kind import PlannerOptions
@@ -86,6 +88,24 @@ class Contender:
         plans = cast(Any, self.planner).plans(moments)
         share = (time.perf_counter() - began) / max(len(problems), 1)
         return [judged(*one, share) for one in zip(problems, moments, plans, strict=True)]
+
+    def parts(self, problems: Sequence[Timed], size: int, kept: Kept) -> list[apart.Part]:
+        """What `run_all` would note and is not in `kept` yet, to be made apart, with at most `size`
+        problems in each part; in one where a set is planned in one call.
+        """
+        own = kept.within(self.name)
+        if self.together:
+            return [] if own.has("all") else [
+                apart.Part([(self.name, "all")], self._apart, (problems,))]
+        left = [i for i in range(len(problems)) if not own.has(str(i))]
+        return [apart.Part([(self.name, str(i)) for i in some], self._apart,
+                           ([problems[i] for i in some],)) for some in apart.chunks(left, size)]
+
+    def _apart(self, problems: Sequence[Timed]) -> list[Any]:
+        self.warm(problems)
+        if self.together:
+            return [self.plan_all(problems)]
+        return [self.plan(problem) for problem in problems]
 
     def warm(self, problems: Sequence[Timed]) -> float:
         """s of the first call, which loads and compiles."""
@@ -207,13 +227,19 @@ def run_all(problems: Sequence[Timed], rows: Sequence[Contender], title: str = "
 
 
 def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, title: str,
-             command: str, kept: Kept = NOTHING) -> dict:
-    """The whole report as a JSON-able document; interrupted, it reports what is done.
+             command: str, kept: Kept = NOTHING, cluster: Cluster | None = None) -> dict:
+    """The whole report as a JSON-able document, of work done here or on a cluster; interrupted,
+    it reports what is done.
 
     Raises InputError before anything is run.
     """
     check(problems, rows)
-    found = run_all(problems, rows, kept=kept)
+    own = list(rows)
+    if cluster is not None:
+        size = cluster.size(len(problems))
+        count, kept = apart.done(cluster, [row.parts(problems, size, kept) for row in rows], kept)
+        own = own[:count]
+    found = run_all(problems, own, kept=kept)
     bootstrap = Bootstrap(len(problems), seed)
     optimal = [best_of(problem) for problem in problems]
     known = sum(one is not None for one in optimal)

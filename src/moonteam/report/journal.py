@@ -101,13 +101,30 @@ class Kept:
         whole = (*self.prefix, *names)
         if whole in self.known:
             return msgspec.convert(self.known[whole], kind)
+        self.begin()
+        made = make()
+        self._add(whole, made)
+        return made
+
+    def copy(self) -> Kept:
+        """The same journal, to be added to by `note`."""
+        return Kept(self.journal, dict(self.known), self.prefix)
+
+    def begin(self) -> None:
+        """Something is to be made."""
         if self.journal is not None:
             self.journal.begin()
-        made = make()
+
+    def note(self, names: tuple[str, ...], made: Any) -> None:
+        """Notes what was made elsewhere, which `once` finds then as a resumed run does."""
+        whole = (*self.prefix, *names)
+        self._add(whole, made)
+        self.known[whole] = msgspec.json.decode(files.dump_json(made))
+
+    def _add(self, whole: tuple[str, ...], made: Any) -> None:
         if self.journal is not None:
             self.journal.add((whole, made))
         interrupts.hold()
-        return made
 
     def has(self, *names: str) -> bool:
         """Whether it was made before."""
