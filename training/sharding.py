@@ -54,6 +54,9 @@ def join(coordinator: str, processes: int, process: int) -> None:
         jax.distributed.initialize(coordinator, processes, process)
     except (RuntimeError, ValueError) as error:
         raise InputError("--coordinator", f"{coordinator}: {str(error).splitlines()[0]}") from None
+    # The first word between devices has to come within half a minute of the others': now, not
+    # after each process has compiled in its own time.
+    multihost_utils.sync_global_devices("joined")
 
 
 def mesh_for(rows: Iterable[int]) -> Mesh:
