@@ -264,6 +264,7 @@ WRITERS = {
     "evaluate slopes": ("evaluate slopes", "slopes.json"),
     "evaluate execution": ("evaluate execution", "rows.jsonl"),
     "evaluate sensitivity": ("evaluate sensitivity", "curves.png"),
+    "evaluate soak": ("evaluate soak", "rows.jsonl"),
     "bench grid": ("bench grid", "bench.json"),
     "bench travel": ("bench travel", "table.md"),
     "bench train": ("bench train", "bench_train.json"),

@@ -3,7 +3,7 @@
 Skills, targets and cells are drawn as in training (`grid.scenarios`); a draw is repeated where
 the ground forbids it: a start that the kind cannot stand on, a target that the robots with its
 skills cannot reach. Events come at random in the middle half of the mission, by the length of
-the exact plan, so that they are the same whoever plans.
+the plan, so that they are the same whoever plans.
 
 Legend: R robots, F missions of a fleet, K kinds.
 """
@@ -20,9 +20,8 @@ import numpy.typing as npt
 from moonteam.errors import InputError
 from moonteam.grid import scenarios
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
-from moonteam.planners import simulate
-from moonteam.planners.base import IntArray, Snapshot
-from moonteam.planners.exact import ExactPlanner
+from moonteam.planners import registry, simulate
+from moonteam.planners.base import IntArray, Plan, Snapshot, WholePlanner
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import (
     Event,
@@ -65,7 +64,7 @@ class Rates:
     slow: float = 0.0  # that one robot is slowed
     silent: float = 0.0  # that one robot is silent for some decisions
     new_targets: int = 0
-    impassable: int = 0  # cells on the exact plan's way that turn out closed to a kind
+    impassable: int = 0  # cells on the way of the plan that turn out closed to a kind
 
 
 @dataclass(frozen=True)
@@ -80,6 +79,8 @@ class Recipe:
     cell_m: float = 1.0
     max_steps: int = 128
     rates: Rates = Rates()
+    team: tuple[tuple[str, str], ...] = TEAM  # names and kinds
+    planner: str = "exact"  # whose plan says that it can be done in time, and when events come
 
     @property
     def site(self) -> Site:
@@ -114,13 +115,19 @@ def make_fleet(recipe: Recipe, count: int,
 
     Raises InputError for numbers out of range, or ground that allows no mission.
     """
-    size = (recipe.side, recipe.side)
-    empty = Mission(Map(size, recipe.cell_m), tuple(
-        Robot(name, kind, ("A",), (0, 0)) for name, kind in TEAM), (), recipe.site)
-    site = change(for_mission(empty))
-    passable = passable_cells(site, empty, team.limits({kind: KINDS.get(kind) for kind in OWN}))
+    site, passable = ground_of(recipe, change)
     drawn = [draw_mission(recipe, number, site, passable) for number in range(count)]
     return fleet_of([m for m, _ in drawn], [n for _, n in drawn], site, passable)
+
+
+def ground_of(recipe: Recipe, change: Callable[[Ground], Ground] = lambda ground: ground
+              ) -> tuple[Ground, dict[str, BoolArray]]:
+    """The site of a recipe's missions, and [H, W] cells that each kind of the team can cross."""
+    empty = Mission(Map((recipe.side, recipe.side), recipe.cell_m), tuple(
+        Robot(name, kind, ("A",), (0, 0)) for name, kind in recipe.team), (), recipe.site)
+    site = change(for_mission(empty))
+    kinds = {kind: KINDS.get(kind) for _, kind in recipe.team}
+    return site, passable_cells(site, empty, team.limits(kinds))
 
 
 def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
@@ -152,46 +159,48 @@ def draw_mission(recipe: Recipe, number: int, site: Ground,
                  passable: dict[str, BoolArray]) -> tuple[Mission, int]:
     """Mission `number` of a recipe, and how many draws it took. Raises InputError."""
     rng = np.random.default_rng([recipe.seed, recipe.site_seed, number])
-    kinds = [kind for _, kind in TEAM]
+    kinds = [kind for _, kind in recipe.team]
+    planner = registry.make(recipe.planner)
     for draws in range(1, MOST_DRAWS + 1):
         drawn = scenarios.generate(
-            rng, num_agents=len(TEAM), num_targets=recipe.num_targets,
+            rng, num_agents=len(kinds), num_targets=recipe.num_targets,
             size=(recipe.side, recipe.side), max_steps=recipe.max_steps, kinds=kinds)
         mission = Mission(
             Map(drawn.size, recipe.cell_m),
             tuple(Robot(name, kind, robot.skills, robot.at) for (name, kind), robot
-                  in zip(TEAM, drawn.agents, strict=True)),
+                  in zip(recipe.team, drawn.agents, strict=True)),
             tuple(Target(t.at, t.skills, t.type) for t in drawn.targets),
             recipe.site, f"{recipe.preset}-{recipe.site_seed}-{number}", recipe.max_steps)
-        if _allowed(mission, site, passable):
-            events = _draw_events(recipe.rates, mission, grid_problem(mission, passable), rng)
+        if plan := _allowed(mission, site, passable, planner):
+            events = _draw_events(recipe.rates, mission, grid_problem(mission, passable), plan, rng)
             done = msgspec.structs.replace(mission, events=events)
             return missions.check(done, done.name), draws
     raise InputError(f"site {recipe.preset} {recipe.site_seed}",
                      f"allows none of {MOST_DRAWS} random missions")
 
 
-def _allowed(mission: Mission, site: Ground, passable: dict[str, BoolArray]) -> bool:
-    """Whether every robot may stand at its start and every target can be solved in time."""
+def _allowed(mission: Mission, site: Ground, passable: dict[str, BoolArray],
+             planner: WholePlanner) -> Plan | None:
+    """The plan, if every robot may stand at its start and every target can be solved in time."""
     for robot in mission.robots:
         x, y = robot.cell
         if not passable[robot.kind][y, x]:
-            return False
+            return None
     snapshot = Snapshot.start(grid_problem(mission, passable))
-    if unsolvable(snapshot) or ExactPlanner().plan(snapshot).makespan is None:
-        return False
+    if unsolvable(snapshot):
+        return None
     try:
         check_starts(site, placements(mission, Frame(mission.map.size, mission.map.cell_m)))
     except InputError:
-        return False
-    return True
+        return None
+    plan = planner.plan(snapshot)
+    return None if plan.makespan is None else plan
 
 
-def _draw_events(rates: Rates, mission: Mission, scenario: Scenario,
+def _draw_events(rates: Rates, mission: Mission, scenario: Scenario, plan: Plan,
                  rng: np.random.Generator) -> tuple[Event, ...]:
-    """Events in the middle half of the exact plan, in the order of their decisions."""
+    """Events in the middle half of the plan, in the order of their decisions."""
     snapshot = Snapshot.start(scenario)
-    plan = ExactPlanner().plan(snapshot)
     length = plan.makespan or 1
     names = [robot.name for robot in mission.robots]
 
@@ -218,11 +227,13 @@ def _draw_events(rates: Rates, mission: Mission, scenario: Scenario,
 
 def _closed_ways(count: int, cells: IntArray, mission: Mission,
                  when: Callable[[], int], rng: np.random.Generator) -> list[Event]:
-    """News that a cell which the exact plan, at `cells` [T + 1, R, 2], has yet to cross with a
+    """News that a cell which the plan, at `cells` [T + 1, R, 2], has yet to cross with a
     robot on the ground is closed to its kind.
     """
     on_ground = [i for i, robot in enumerate(mission.robots) if not KINDS.get(robot.kind).flies]
-    found = []
+    found: list[Event] = []
+    if not on_ground:
+        return found
     for _ in range(count):
         at, robot = when(), int(rng.choice(on_ground))
         step = int(rng.integers(min(at + 1, len(cells) - 1), len(cells)))

@@ -26,7 +26,7 @@ import numpy as np
 
 from moonteam.report.intervals import Bootstrap, Figure
 from sim2grid.loop.fused.whole import LACKS
-from sim2grid.measure.metrics import RobotReport
+from sim2grid.measure.metrics import Report, RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
 
 
@@ -126,9 +126,14 @@ def legs_sent(robot: RobotReport) -> int:
 
 def failure_label(row: Row) -> str:
     """Cause of a failed mission, with what was lost on the way: `unsolvable: KIND stuck`."""
-    losses = sorted(f"{robot.kind} {robot.lost.replace('_', ' ')}" for robot in row.report.robots
+    return cause_of(row.report)
+
+
+def cause_of(report: Report) -> str:
+    """The same of the report alone."""
+    losses = sorted(f"{robot.kind} {robot.lost.replace('_', ' ')}" for robot in report.robots
                     if robot.lost)
-    cause = (row.report.cause or "").replace("_", " ")
+    cause = (report.cause or "").replace("_", " ")
     return f"{cause}: {', '.join(losses)}" if losses else cause
 
 

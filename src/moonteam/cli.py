@@ -41,6 +41,8 @@ COMMANDS = {
     "evaluate sensitivity": (
         "sim2grid.commands.evaluate_sensitivity",
         "success and seconds against slope, friction, noise"),
+    "evaluate soak": (
+        "sim2grid.commands.evaluate_soak", "unlike missions in physics, memory, failures"),
     "evaluate preference": (
         "moonteam.commands.evaluate_preference", "a policy's trade-off of time and effort"),
     "evaluate traverse": (
