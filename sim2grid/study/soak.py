@@ -252,8 +252,8 @@ def _stage(seed: int, index: int) -> Stage:
 
 def _draw(recipe: Recipe, number: int, site: Any, passable: dict[str, Any]) -> Mission:
     rng = np.random.default_rng([recipe.seed, number, 4])
-    chances = rng.choice((0.0, 0.0, 1.0), 3)
-    rates = Rates(*map(float, chances), int(rng.integers(MOST_NEW + 1)), int(rng.integers(3)))
+    lose, slow, silent = (float(one) for one in rng.choice((0.0, 0.0, 1.0), 3))
+    rates = Rates(lose, slow, silent, int(rng.integers(MOST_NEW + 1)), int(rng.integers(3)))
     mission, _ = draw_mission(
         replace(recipe, num_targets=recipe_targets(recipe.seed, number), rates=rates,
                 max_steps=4 * recipe.side + 32), number, site, passable)
