@@ -1,7 +1,9 @@
 """Greedy and local search by the clock."""
 
+import dataclasses
 import time
 
+import numpy as np
 import pytest
 
 from moonteam.planners.seconds import local
@@ -31,6 +33,13 @@ def test_what_is_found_is_a_plan_and_mostly_the_best_one(instances):
     assert found > 100
     assert missed <= 0.03 * found
     assert best >= 0.85 * found
+
+
+def test_where_nothing_is_open_nothing_is_served(instances, recwarn):
+    now = instances.large(0, 3, 4)
+    now = dataclasses.replace(now, solved=np.ones_like(now.solved))
+    assert LocalSearchPlanner(iterations=10).plan(now).services == ()
+    assert not recwarn.list
 
 
 def test_greedy_is_a_plan_and_the_floor(instances):

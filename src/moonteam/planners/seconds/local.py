@@ -82,7 +82,7 @@ def steering(work: Work, alpha: float, beta: float) -> tuple[annealing.Goal, flo
     """
     legs = work.between[work.between < NEVER]
     agents = len(work.free)
-    unit = float(legs.mean() if legs.size else 0.0) + float(work.service.mean()) + 1.0
+    unit = sum(float(some.mean()) for some in (legs, work.service) if some.size) + 1.0
     by_way = min(0.3, 2.0 / agents, max(0.1, 1.4 / agents))
     by_way *= alpha / max(float(work.effort.mean()), 1e-9)
     goal = annealing.Goal(alpha, beta + by_way, 0.4 * alpha, 100.0 * (alpha + beta))
