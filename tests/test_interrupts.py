@@ -8,6 +8,8 @@ import time
 
 import pytest
 
+from tests.signalled import begins
+
 BUSY = 8.0
 """s more than promised, for a machine that has other work."""
 BEGIN = """
@@ -38,13 +40,10 @@ NUMBERS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 def run(work, *signals, ignored=()):
     """(code, standard output, standard error, s from the last signal to the end) of some work."""
-    def ignore():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
-
-    child = subprocess.Popen(
-        [sys.executable, "-c", f"{BEGIN}\ndef work():\n    {work}\nstarted()"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=ignore)
+    with begins(ignored):
+        child = subprocess.Popen(
+            [sys.executable, "-c", f"{BEGIN}\ndef work():\n    {work}\nstarted()"],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert child.stdout.readline() == b"ready\n"
     said = b""
     for number in signals:

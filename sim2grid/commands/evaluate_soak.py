@@ -48,14 +48,11 @@ class Args(Seeded, Resumable, Reported):
     """Missions."""
     seconds: Aside[float | None] = None
     """No mission is begun after so many; --resume goes on."""
-    out: Aside[Path | None] = Path("runs/soak")
-    """Folder to write files to."""
 
 
 def run(args: Args) -> int:
     """Runs what is not done yet, prints, saves."""
     journal.check(args, (("count", 1, 1_000_000), ("seed", 0, 2**31)))
-    assert args.out is not None
     from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
@@ -63,14 +60,17 @@ def run(args: Args) -> int:
     from moonteam.report.tables import print_plain
     from sim2grid.study.soak import Entry, Soak
 
-    held = Journal[Entry](args.out, args.resume, command.figures(args), Entry, FILES)
-    entries, out = held.entries, args.out
+    out, held = args.out, None
+    if out:
+        held = Journal[Entry](out, args.resume, command.figures(args), Entry, FILES)
+    entries: list[Entry] = held.entries if held else []
 
-    def keep(entry: Entry, mission: Mission | None, who: Who) -> None:
-        if not entry.success and mission is not None:
+    def keep(entry: Entry, mission: Mission | None) -> None:
+        if out and not entry.success and mission is not None:
             _write(_file(out, entry.number), mission)
         entries.append(entry)
-        held.add(entry)
+        if held:
+            held.add(entry)
 
     begun, interrupted = time.perf_counter(), False
     soak = Soak(args.seed, args.count, keep, {entry.number for entry in entries}, args.seconds)
@@ -81,15 +81,16 @@ def run(args: Args) -> int:
     report = _document(args, entries, time.perf_counter() - begun)
     if interrupted:
         report["interrupted"] = True
-    _save(out, report, entries)
-    print_plain(args, report, _tables(entries, out))
+    if out:
+        _save(out, report, entries)
+    print_plain(args, report, _tables(entries))
     if interrupted:
         return journal.interrupted(out)
     return int(any(entry.traceback for entry in entries))
 
 
-def _file(out: Path, number: int) -> Path:
-    return out / FAILED / f"{number:04d}.yaml"
+def _file(out: Path | None, number: int) -> Path:
+    return (out or Path()) / FAILED / f"{number:04d}.yaml"
 
 
 def _write(path: Path, mission: Mission) -> None:
@@ -112,7 +113,6 @@ def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any
     from moonteam.report import provenance
     from sim2grid.study.soak import failures, memory, who_decides
 
-    assert args.out is not None
     line = memory(entries)
     wall = sum(entry.wall_s for entry in entries)
     notes = [f"Resident memory: {line['first_mib']} MiB after the first mission, "
@@ -130,7 +130,7 @@ def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any
             "tracebacks": {entry.number: entry.traceback for entry in entries if entry.traceback}}
 
 
-def _tables(entries: list[Entry], out: Path) -> list[tuple[list[str], list[list[str]]]]:
+def _tables(entries: list[Entry]) -> list[tuple[list[str], list[list[str]]]]:
     from sim2grid.study.soak import failures, table
 
     heads = ["missions", "solved", "failed", "s a mission"]
@@ -148,6 +148,6 @@ def _save(out: Path, report: dict[str, Any], entries: list[Entry]) -> None:
     from sim2grid.study.soak import figure
 
     files.write_json(out / "report.json", report)
-    files.write_text(out / "table.md", plain_markdown(report, _tables(entries, out)) + "\n")
+    files.write_text(out / "table.md", plain_markdown(report, _tables(entries)) + "\n")
     with files.replacing(out / "soak.png") as temporary:
         figure(entries).savefig(temporary, dpi=110)

@@ -152,13 +152,12 @@ class Stage:
 class Soak:
     """`count` missions, one after the other.
 
-    `keep` is called with each entry, the mission and who decided; `mission` is None where it could
-    not even be drawn.
+    `keep` is called with each entry and its mission, None where that could not even be drawn.
     """
 
     seed: int
     count: int
-    keep: Callable[[Entry, Mission | None, Who], None]
+    keep: Callable[[Entry, Mission | None], None]
     done: set[int] = field(default_factory=set)
     seconds: float | None = None  # after which no other mission is begun
 
@@ -191,7 +190,7 @@ class Soak:
             (cause_of(report) if report else "exception: " + (failed or "").split("\n")[-2])
             if lost else None, failed, report and report.seconds, report and report.decisions,
             round(time.perf_counter() - begun, 3), round(resident_mb() * 1e6 / 2**20, 1), first),
-            mission, who)
+            mission)
         interrupts.hold()
 
 

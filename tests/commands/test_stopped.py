@@ -13,15 +13,11 @@ import time
 import pytest
 
 from tests.killed import kill_once
+from tests.signalled import begins
 
 CHILD = {"JAX_PLATFORMS": "cpu"}
 BUSY = 8.0
 """s more than the second in which a signal is answered, for a machine that has other work."""
-
-
-def listening():
-    """Before a child: in the background of a script signals are ignored, and that is inherited."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def rows(out):
@@ -33,9 +29,10 @@ class Child:
     """`moonteam WORDS`, and what it says on standard error as it says it."""
 
     def __init__(self, words):
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "moonteam.cli", *words], env=os.environ | CHILD,
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=listening)
+        with begins():
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "moonteam.cli", *words], env=os.environ | CHILD,
+                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         self.said, self.when = b"", []
         self._reader = threading.Thread(target=self._read)
         self._reader.start()

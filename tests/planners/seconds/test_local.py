@@ -1,7 +1,7 @@
 """Greedy and local search by the clock."""
 
-import dataclasses
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,13 +35,6 @@ def test_what_is_found_is_a_plan_and_mostly_the_best_one(instances):
     assert best >= 0.85 * found
 
 
-def test_where_nothing_is_open_nothing_is_served(instances, recwarn):
-    now = instances.large(0, 3, 4)
-    now = dataclasses.replace(now, solved=np.ones_like(now.solved))
-    assert LocalSearchPlanner(iterations=10).plan(now).services == ()
-    assert not recwarn.list
-
-
 def test_greedy_is_a_plan_and_the_floor(instances):
     floor = better = 0
     for seed in range(6):
@@ -50,6 +43,18 @@ def test_greedy_is_a_plan_and_the_floor(instances):
         local = instances.judged(now, LocalSearchPlanner(iterations=5000).plan(now))
         floor, better = floor + greedy.makespan, better + local.makespan
     assert better < 0.9 * floor
+
+
+@pytest.mark.parametrize("planner", [GreedyPlanner(), LocalSearchPlanner(iterations=100)])
+def test_nothing_open_or_nobody_left(instances, planner):
+    """As between the last target and one that an event has yet to bring; no warnings either."""
+    now = instances.large(0, 2, 3, skills=2, most=1)
+    done = replace(now, solved=np.ones(3, bool), ends=np.array([5, 9, 2]))
+    plan = instances.judged(done, planner.plan(done))
+    assert (plan.services, plan.makespan) == ((), 9)
+    nobody = np.zeros(2, bool)
+    assert planner.plan(replace(done, present=nobody)).services == ()
+    assert planner.plan(replace(now, present=nobody)).status == "infeasible"
 
 
 def test_a_budget_of_iterations_makes_it_repeatable(instances):

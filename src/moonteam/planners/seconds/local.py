@@ -141,6 +141,9 @@ def search(opened: Open, alpha: float, beta: float, iterations: int | None = Non
 
     Each of the threads makes its own moves, so many or for so long, and the best of all counts.
     """
+    if not len(opened.targets):  # such as between the last one and one that an event will bring
+        none, cost = space_for(opened.work)[0], alpha * opened.work.floor
+        return Best(cost, 0.0, none.order, none.team, none.size, 0, [(0.0, cost)], 0.0)
     stop = threading.Event()
 
     def one(number: int) -> Best:
@@ -223,7 +226,7 @@ def _run(opened: Open, alpha: float, beta: float, iterations: int | None, until:
     curve = [(time.perf_counter() - began, float(best[0]))]
     done, block, rest = 0, _BLOCK, 0.0
     again = _AGAIN * len(plan.order) if len(plan.order) <= _SMALL else 0
-    while len(order) > 0 and not stop.is_set():
+    while not stop.is_set():
         clock = time.perf_counter()
         share = 0.0 if iterations is None else done / max(iterations, 1)
         if until < math.inf:
