@@ -154,8 +154,8 @@ def test_real_robots_do_it_as_planned(tiny, capsys, tmp_path):
     look, core = report["targets"]
     assert look["time_s"] < core["time_s"]
     assert look["expected_s"] == pytest.approx(plan["schedule"][0]["end"])
-    again = printed(capsys, "rollout", tiny, "--backend", "native", "--no-video", "--out",
-                    str(out))
+    again = printed(capsys, "rollout", tiny, "--backend", "native", "--no-video", "--force",
+                    "--out", str(out))
     assert again == report
 
 
