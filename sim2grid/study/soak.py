@@ -166,31 +166,30 @@ class Soak:
         begun = time.perf_counter()
         todo = [number for number in range(self.count) if number not in self.done]
         with bar("soak", self.count, self.count - len(todo)) as update:
-            for number in todo:
+            for done, number in enumerate(todo, self.count - len(todo) + 1):
                 if self.seconds is not None and time.perf_counter() - begun > self.seconds:
                     return
                 self._one(number, todo[0])
-                update(self.count - len(todo) + todo.index(number) + 1, f"mission {number}")
+                update(done, f"mission {number}")
 
     def _one(self, number: int, first: int) -> None:
         begun, recipe = time.perf_counter(), block(self.seed, number // BLOCK)
-        who, report, mission, failed = who_decides(self.seed, number), None, None, None
+        who, report, mission, failed, cause = who_decides(self.seed, number), None, None, None, None
         try:
             stage = _stage(self.seed, number // BLOCK)
             mission = stage.fleet.missions[number % BLOCK]
             report = stage.run(number % BLOCK, who)
-        except Exception:
+            cause = None if report.success else cause_of(report)
+        except Exception as error:
             failed = traceback.format_exc()
-        lost = report.cause is not None if report else True
+            cause = f"exception: {type(error).__name__}: {error}"
         self.keep(Entry(
             number, recipe.preset, recipe.site_seed, recipe.side,
             tuple(kind for _, kind in recipe.team), recipe_targets(self.seed, number),
             tuple(what(event) for event in mission.events) if mission else (), who.mode,
-            who.planner, report is not None and report.success,
-            (cause_of(report) if report else "exception: " + (failed or "").split("\n")[-2])
-            if lost else None, failed, report and report.seconds, report and report.decisions,
-            round(time.perf_counter() - begun, 3), round(resident_mb() * 1e6 / 2**20, 1), first),
-            mission)
+            who.planner, cause is None, cause, failed, report and report.seconds,
+            report and report.decisions, round(time.perf_counter() - begun, 3),
+            round(resident_mb() * 1e6 / 2**20, 1), first), mission)
         interrupts.hold()
 
 
@@ -251,7 +250,7 @@ def _stage(seed: int, index: int) -> Stage:
 
 def _draw(recipe: Recipe, number: int, site: Any, passable: dict[str, Any]) -> Mission:
     rng = np.random.default_rng([recipe.seed, number, 4])
-    lose, slow, silent = (float(one) for one in rng.choice((0.0, 0.0, 1.0), 3))
+    lose, slow, silent = (float(chance) for chance in rng.choice((0.0, 0.0, 1.0), 3))
     rates = Rates(lose, slow, silent, int(rng.integers(MOST_NEW + 1)), int(rng.integers(3)))
     mission, _ = draw_mission(
         replace(recipe, num_targets=recipe_targets(recipe.seed, number), rates=rates,

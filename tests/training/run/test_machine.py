@@ -16,8 +16,9 @@ import pytest
 from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.grid import env
-from moonteam.interrupts import Stop, postponed
+from moonteam.interrupts import Stop
 from tests.killed import kill_when_saved
+from tests.signalled import begins
 from training.mappo import update
 from training.mappo.config import BOOTSTRAP, REFINEMENT, Config, Phase
 from training.mappo.trainee import Mappo
@@ -161,14 +162,22 @@ def test_sigterm_while_training_saves_and_the_run_goes_on_from_there(tmp_path):
     assert updates == list(range(2, done + 3, 2))
 
 
-def test_signals_ask_to_stop_and_then_the_run_saves(tmp_path):
-    before = signal.getsignal(signal.SIGTERM)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        with postponed() as stop:
-            assert not stop.asked
-            os.kill(os.getpid(), number)
-            assert stop.asked
-    assert signal.getsignal(signal.SIGTERM) is before
+def test_signals_only_ask_to_stop():
+    """In a process of its own: the one that tests may have been started with SIGINT ignored."""
+    with begins():
+        subprocess.run([sys.executable, "-c", """
+import os, signal
+from moonteam.interrupts import postponed
+for number in (signal.SIGTERM, signal.SIGINT):
+    with postponed() as stop:
+        assert not stop.asked
+        os.kill(os.getpid(), number)
+        assert stop.asked
+assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+"""], check=True)
+
+
+def test_asked_to_stop_the_run_saves(tmp_path):
     run = Run(Mappo(TINY), tmp_path, resume=False)
     run.train(Stop(), stop_after=2)
     again = Run(Mappo(TINY), tmp_path, resume=True)
