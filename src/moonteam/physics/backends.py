@@ -239,6 +239,21 @@ class MjxBackend:
                  trees.where(frozen, jnp.zeros_like(propellant), propellant)))
 
 
+def _control_world(scene: Scene, memories: Any, orders: Any, surface: Surface, seen: Array,
+                   memory: Array, told: Array) -> tuple[Array, Array]:
+    """One world: seen [1 + nq + nv], controllers' memory and commands side by side, which have the
+    shapes of `memories` and `orders`.
+
+    Returns ctrl, power and propellant side by side [nu + 2 R], and the new memory.
+    """
+    now, qpos, qvel = jnp.split(seen, (1, 1 + scene.model.nq))
+    ctrl, controls, power, propellant = _call_controllers(
+        scene.robots, scene.model.nu, surface, now[0], qpos, qvel,
+        _shaped(memories, memory), _shaped(orders, told))
+    leaves = [leaf.reshape(-1).astype(jnp.float32) for leaf in jax.tree.leaves(controls)]
+    return jnp.concatenate([ctrl, power, propellant]), jnp.concatenate(leaves)
+
+
 class NativeBackend:
     """C MuJoCo: `mujoco.batch` steps the worlds on a thread pool, bit-identical at any number
     of threads; all controllers of all worlds are one jitted call on the CPU in between.
@@ -265,7 +280,9 @@ class NativeBackend:
         self._reset = jax.jit(jax.vmap(start))
         # Called every control step: few, flat arrays, and jit's own fast dispatch.
         self._controllers = jax.jit(
-            jax.vmap(self._control_world, in_axes=(None, 0, 0, 0)),
+            # Not a method: the engine would hold itself until the garbage collector comes by.
+            jax.vmap(partial(_control_world, scene, self._memory, self._told),
+                     in_axes=(None, 0, 0, 0)),
             compiler_options=_on_one_thread())
 
     def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
@@ -311,19 +328,6 @@ class NativeBackend:
             self._surface, worlds.seen(), self._remember(state.control, batch),
             _flat(hold(self.scene, batch), batch)))
         return time.perf_counter() - begun
-
-    def _control_world(self, surface: Surface, seen: Array, memory: Array, told: Array
-                       ) -> tuple[Array, Array]:
-        """One world: seen [1 + nq + nv], controllers' memory and commands side by side.
-
-        Returns ctrl, power and propellant side by side [nu + 2 R], and the new memory.
-        """
-        now, qpos, qvel = jnp.split(seen, (1, 1 + self.scene.model.nq))
-        ctrl, controls, power, propellant = _call_controllers(
-            self.scene.robots, self.scene.model.nu, surface, now[0], qpos, qvel,
-            _shaped(self._memory, memory), _shaped(self._told, told))
-        leaves = [leaf.reshape(-1).astype(jnp.float32) for leaf in jax.tree.leaves(controls)]
-        return jnp.concatenate([ctrl, power, propellant]), jnp.concatenate(leaves)
 
     def _remember(self, controls: Controls, batch: int) -> Array:
         """The controllers' memory [B, n] where their next one will be, lest jit compile twice."""
