@@ -160,7 +160,8 @@ def test_what_answers_and_is_no_cluster_is_one_line(capsys):
 @pytest.mark.parametrize("words", [
     (GOLDEN, "--limit", "30", "--planner", "exact", "--planner", "policy", "--decode", "argmax",
      "--decode", "best-of-2", "--objective", "makespan", "--objective", "moves"),
-    ("seconds/3x5-7", "--limit", "30", "--planner", "exact", "--planner", "policy")])
+    ("seconds/3x5-7", "--limit", "30", "--planner", "exact", "--planner", "policy",
+     "--policy", "any_team_mappo")])
 def test_a_table_of_plans_is_the_same(words):
     found = [json.loads(finished(moonteam("evaluate", "grid", *words, "--json", *on))[0])
              for on in ((), ("--on", "ray"))]

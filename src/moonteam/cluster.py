@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple, TypeVar
 
 from moonteam import compilation, interrupts
@@ -230,6 +230,16 @@ def _checked(on: str) -> tuple[str, int] | None:
     return host, int(port)
 
 
+def _say_on_stderr() -> None:
+    """Ray prints what befell a worker on standard output, where a command's JSON document is."""
+    with suppress(ImportError, AttributeError):
+        from ray._private import worker
+
+        print_to: Any = worker.print_to_stdstream
+        worker.print_to_stdstream = lambda data, *rest, **named: print_to(
+            data | {"is_err": True}, *rest, **named)
+
+
 def _connect(ray: Any, on: str, address: tuple[str, int] | None) -> None:
     """Joins the cluster, or begins one. Raises InputError."""
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -238,6 +248,7 @@ def _connect(ray: Any, on: str, address: tuple[str, int] | None) -> None:
                   "object_store_memory": _STORE}
     else:
         _check_answer(on, address)
+    _say_on_stderr()
     try:
         ray.init("local" if address is None else on, **quiet)
     except (ConnectionError, ImportError, OSError, RuntimeError, ValueError) as error:
