@@ -7,6 +7,7 @@ Ray is imported when a cluster is asked for, and at no other time.
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
 import re
@@ -69,16 +70,27 @@ class _Refused(NamedTuple):
     key: str
 
 
-def _answered(setup: _Setup | None, box: bytes) -> bytes:
-    """In a worker: what came of a function and its arguments, both ways as bytes."""
+def _answered(setup: _Setup | None, box: bytes, work: Callable[..., Any]) -> bytes:
+    """In a worker: what came of a function and its arguments, both ways as bytes.
+
+    `setup` is None where the process is prepared.
+    """
     try:
         if setup is not None:
             setup.make()
-        work, arguments = pickle.loads(box)
-        answer = work(*arguments)
+        answer = work(*pickle.loads(box))
     except InputError as error:
         answer = _Refused(error.source, error.problem, error.key)
     return pickle.dumps(answer)
+
+
+def _called(work: Callable[..., Any], arguments: tuple) -> Any:
+    return work(*arguments)
+
+
+def _piece(setup: _Setup, box: bytes) -> bytes:
+    """In a worker: what came of a piece, a function and its arguments."""
+    return _answered(setup, box, _called)
 
 
 class _Holder:
@@ -97,13 +109,7 @@ class _Holder:
             return getattr(self._thing, method)(*arguments)
 
         setup, self._setup = self._setup, None
-        try:
-            if setup is not None:
-                setup.make()
-            answer = work(*pickle.loads(box))
-        except InputError as error:
-            answer = _Refused(error.source, error.problem, error.key)
-        return pickle.dumps(answer)
+        return _answered(setup, box, work)
 
 
 class Held:
@@ -142,7 +148,7 @@ class Cluster:
 
         Raises InputError as `work` does, or if one piece has lost all its workers.
         """
-        remote = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_answered)
+        remote = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_piece)
         waiting = {remote.remote(self._setup, _packed((work, piece))): number
                    for number, piece in enumerate(pieces)}
         while waiting:
@@ -233,9 +239,8 @@ def _checked(on: str) -> tuple[str, int] | None:
 def _say_on_stderr() -> None:
     """Ray prints what befell a worker on standard output, where a command's JSON document is."""
     with suppress(ImportError, AttributeError):
-        from ray._private import worker
-
-        print_to: Any = worker.print_to_stdstream
+        worker: Any = importlib.import_module("ray._private.worker")
+        print_to = worker.print_to_stdstream
         worker.print_to_stdstream = lambda data, *rest, **named: print_to(
             data | {"is_err": True}, *rest, **named)
 

@@ -34,11 +34,8 @@ def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int
     world = worlds.build(scenarios)
     for contender in rows:
         contender.check(world)
-    whole = list(rows)
-    if cluster is not None:
-        size = cluster.size(len(world))
-        count, kept = apart.done(cluster, [row.parts(world, size, kept) for row in rows], kept)
-        whole = whole[:count]
+    whole, kept = apart.done(cluster, rows, len(world), kept,
+                             lambda row, size, kept: row.parts(world, size, kept))
     found = run_all(whole, world, kept=kept)
     reference = optima.reference(world.scenarios)
     return document(world.family, found, reference, seed, title, command) | missing(found, rows)

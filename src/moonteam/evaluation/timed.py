@@ -234,11 +234,8 @@ def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, ti
     Raises InputError before anything is run.
     """
     check(problems, rows)
-    own = list(rows)
-    if cluster is not None:
-        size = cluster.size(len(problems))
-        count, kept = apart.done(cluster, [row.parts(problems, size, kept) for row in rows], kept)
-        own = own[:count]
+    own, kept = apart.done(cluster, rows, len(problems), kept,
+                           lambda row, size, kept: row.parts(problems, size, kept))
     found = run_all(problems, own, kept=kept)
     bootstrap = Bootstrap(len(problems), seed)
     optimal = [best_of(problem) for problem in problems]

@@ -130,7 +130,7 @@ def load(opened: Open, plan: annealing.Plan, space: annealing.Scratch, goal: ann
 def temperatures(count: int) -> tuple[float, float]:
     """In units, at the beginning and at the end; found by trying (DCMRTA and HeteroMRTA)."""
     if count <= _SMALL:
-        return min(100.0 / max(count, 1) ** 2, 0.3), 0.01
+        return min(100.0 / count**2, 0.3), 0.01
     hot = min(2.0 / count, 100.0 / count**2)
     return hot, min(max(0.01, 25.0 / count**2), 0.5 * hot)
 
@@ -167,7 +167,7 @@ def _runs(opened: Open, alpha: float, beta: float, iterations: int | None, until
     moves = most if iterations is None else min(most or iterations, iterations)
     first = _run(opened, alpha, beta, moves, until, seed, stop)
     found = [first]
-    if most is None or count == 0:
+    if most is None:
         return first
 
     def left() -> tuple[float, int | None]:
