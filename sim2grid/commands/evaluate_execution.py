@@ -59,7 +59,7 @@ class Args(Planning, Missions, Apart, Resumable, Reported):
     decision is a target, planned in seconds and driven at any angle (closed; exact in place of
     policies that do not point at targets)."""
     planner: tuple[str, ...] = ("policy",)
-    """Who decides: registered planners (policy, exact, greedy, lns, cpsat, exhaustive,
+    """Who decides: registered planners (policy, auto, exact, greedy, lns, cpsat, exhaustive,
     another package's), or
     FILE.py:OBJECT."""
     cell: float = 1.0

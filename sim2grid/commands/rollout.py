@@ -58,7 +58,7 @@ class Args(Planning, Forced, Printed):
     mission: tyro.conf.Positional[str] = ""
     """Mission file (.yaml) or the name of a bundled mission; not with --from."""
     planner: str | None = None
-    """Who decides: a registered planner (policy, exact, greedy, lns, cpsat, exhaustive,
+    """Who decides: a registered planner (policy, auto, exact, greedy, lns, cpsat, exhaustive,
     another package's), or FILE.py:OBJECT. Default: policy; by the clock exact."""
     mode: Literal["barrier", "async", "clock"] | None = None
     """barrier: all robots decide together; async: each decides when it arrives; clock: a decision

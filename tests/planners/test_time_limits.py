@@ -19,7 +19,7 @@ from moonteam.problem import timed
 
 LOADED = 5.0
 SIZES = {"3x7": (3, 7, 32), "20x12": (20, 12, 48), "8x40": (8, 40, 40), "20x100": (20, 100, 48)}
-PLANNERS = {"steps": ("exact", "cpsat", "lns"), "seconds": ("exact", "cpsat", "lns")}
+PLANNERS = dict.fromkeys(("steps", "seconds"), ("exact", "cpsat", "lns", "auto"))
 
 
 def scenario(size):

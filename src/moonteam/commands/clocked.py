@@ -160,6 +160,8 @@ def show(case: Case, plan: TimedPlan) -> None:
     console.print(f"makespan {plan.makespan / MS:.1f} {unit}, {plan.effort / MS:.1f} {unit} of "
                   "travel in all", soft_wrap=True, highlight=False)
     console.print(verdict(case, plan), soft_wrap=True, highlight=False)
+    if plan.reason:
+        console.print(f"{plan.planner}: {plan.reason}", soft_wrap=True, highlight=False)
 
 
 def verdict(case: Case, plan: TimedPlan) -> str:

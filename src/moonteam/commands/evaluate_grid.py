@@ -34,8 +34,8 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     may be given several times.
 
     Of a set by the clock (its objects say "clock": "seconds"), makespan and effort are in its
-    own unit of time, and planners are those by the clock: exact, greedy, lns, cpsat, exhaustive,
-    and policy with a network that points at targets.
+    own unit of time, and planners are those by the clock: auto, exact, greedy, lns, cpsat,
+    exhaustive, and policy with a network that points at targets.
 
     Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png; and rows.jsonl, to
     which each plan is added as it is made (a policy's batch as a whole), so that --resume goes on.
@@ -54,7 +54,7 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     """Scenario set (.jsonl), scenario (.json), or the name of a bundled set; without it,
     --count scenarios are drawn from --seed."""
     planner: Many[tuple[str, ...]] = ()
-    """exact, greedy, lns, exhaustive, cpsat, policy, another package's, or FILE.py:OBJECT;
+    """auto, exact, greedy, lns, exhaustive, cpsat, policy, another package's, or FILE.py:OBJECT;
     again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves (by the clock: effort) or weighted; again for more rows. Default: makespan,

@@ -39,7 +39,7 @@ class Args(Drawn, Limited, Resumable, Reported):
     set: tyro.conf.Positional[str | None] = None
     """Scenario set (.jsonl) or the name of a bundled one."""
     planner: Many[tuple[str, ...]] = ()
-    """exact, greedy, lns, policy, another package's, or FILE.py:OBJECT; again for more rows.
+    """auto, exact, greedy, lns, policy, another package's, or FILE.py:OBJECT; again for more rows.
     Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves or weighted; again for more rows. Default: makespan."""

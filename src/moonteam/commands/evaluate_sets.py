@@ -48,8 +48,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     sets: tyro.conf.Positional[tuple[str, ...]] = ()
     """Bundled sets or files (.jsonl); all bundled ones if not given."""
     planner: Many[tuple[str, ...]] = ()
-    """policy, exact, greedy, lns, exhaustive, cpsat, another package's, or FILE.py:OBJECT; again
-    for more. Default: policy."""
+    """policy, auto, exact, greedy, lns, exhaustive, cpsat, another package's, or
+    FILE.py:OBJECT; again for more. Default: policy."""
     policy: Many[tuple[str, ...]] = ()
     """Policy file (.safetensors) or the name of a bundled policy; again for more. Default:
     any_team."""

@@ -49,7 +49,8 @@ class Args(Planning, Saved, Printed):
     scenario: tyro.conf.Positional[str]
     """Scenario, set.jsonl:INDEX or set.jsonl:ID, or mission."""
     planner: str = "exact"
-    """exact (proves its plan the best; up to 12 targets), greedy, lns (large-neighbourhood
+    """auto (exact if that is certified in half of the time, else local search; it says which and
+    why), exact (proves its plan the best; up to 12 targets), greedy, lns (large-neighbourhood
     search), cpsat (needs the extra ortools), exhaustive (up to 6 targets), policy, another
     package's, or FILE.py:OBJECT."""
     seed: int = 0
@@ -134,6 +135,8 @@ def print_plan(case: Case, plan: Plan, alpha: float, beta: float) -> None:
     console.print(f"makespan {plan.makespan} steps, {plan.moves} moves ({each})",
                   soft_wrap=True, highlight=False)
     console.print(_verdict(plan, alpha, beta), soft_wrap=True, highlight=False)
+    if plan.reason:
+        console.print(f"{plan.planner}: {plan.reason}", soft_wrap=True, highlight=False)
 
 
 def _verdict(plan: Plan, alpha: float, beta: float) -> str:

@@ -77,11 +77,33 @@ class Follower(ABC):
         return joint
 
 
-class RoutePlanner(Follower):
-    """A Planner made of a search for routes.
+class PlanFollower(Follower):
+    """A Planner that follows whole plans.
 
     When the team cannot solve every target, or not in the steps left, `act` still works on
     those it can solve.
+    """
+
+    @abstractmethod
+    def plan(self, snapshot: Snapshot) -> Plan:
+        """A whole plan from this moment. Raises InputError if the planner cannot serve it."""
+
+    def _ahead(self, snapshot: Snapshot) -> IntArray:
+        return self._best_effort(snapshot).actions
+
+    def _best_effort(self, snapshot: Snapshot) -> Plan:
+        plan = self.plan(snapshot)
+        if plan.status != "infeasible":
+            return plan
+        hopeless = list(obstacles(snapshot, travel_times(snapshot)))
+        solved = snapshot.solved.copy()
+        solved[hopeless] = True
+        longer = max(snapshot.max_steps, snapshot.step + 1) * 64
+        return self.plan(replace(snapshot, solved=solved, max_steps=longer))
+
+
+class RoutePlanner(PlanFollower):
+    """A Planner made of a search for routes.
 
     Args:
       objective: makespan (with few moves as the second wish), moves, or weighted.
@@ -113,7 +135,7 @@ class RoutePlanner(Follower):
     def plan(self, snapshot: Snapshot) -> Plan:
         """A whole plan from this moment. Raises InputError if the planner cannot serve it."""
         if self.time_limit is not None:
-            _compile(type(self))
+            compiled(type(self))
         return self._plan(snapshot)
 
     def _plan(self, snapshot: Snapshot) -> Plan:
@@ -137,22 +159,9 @@ class RoutePlanner(Follower):
                             "optimal" if answer.proved else "feasible", answer.bound)
         return plan_of_routes(snapshot, travel, task.named(answer.routes), claim, seconds)
 
-    def _ahead(self, snapshot: Snapshot) -> IntArray:
-        return self._best_effort(snapshot).actions
-
-    def _best_effort(self, snapshot: Snapshot) -> Plan:
-        plan = self.plan(snapshot)
-        if plan.status != "infeasible":
-            return plan
-        hopeless = list(obstacles(snapshot, travel_times(snapshot)))
-        solved = snapshot.solved.copy()
-        solved[hopeless] = True
-        longer = max(snapshot.max_steps, snapshot.step + 1) * 64
-        return self.plan(replace(snapshot, solved=solved, max_steps=longer))
-
 
 @functools.cache
-def _compile(kind: type[RoutePlanner]) -> None:
+def compiled(kind: type[RoutePlanner]) -> None:
     """Has one of that kind plan, once a process: its first call compiles or loads what it needs."""
     trial = kind._trial()
     if trial is not None:

@@ -26,7 +26,7 @@ _REGISTRY: Registry[object] = Registry("planner by the clock", _HERE, object, {
     "exact": f"{_HERE}.exact:ExactPlanner", "greedy": f"{_HERE}.greedy:GreedyPlanner",
     "lns": f"{_HERE}.local:LocalSearchPlanner", "cpsat": f"{_HERE}.cpsat:CpSatPlanner",
     "exhaustive": f"{_HERE}.exhaustive:ExhaustivePlanner",
-    "policy": f"{_HERE}.policy:PolicyPlanner"})
+    "policy": f"{_HERE}.policy:PolicyPlanner", "auto": f"{_HERE}.auto:AutoPlanner"})
 
 
 @dataclass(frozen=True)
