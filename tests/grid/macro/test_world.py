@@ -170,6 +170,15 @@ def test_who_is_bound_to_a_target_is_waited_for():
     assert result.state.since.tolist() == [9.0, 9.0]
 
 
+def test_who_arrives_serves_before_others_decide():
+    """Else the other, who waits, would be sent off: nobody would seem to be on the way."""
+    problem = team([[1, 0], [1, 0]], [[1, 0], [1, 0]], [[2.0, 9.0], [5.0, 9.0]],
+                   [[0.0, 3.0], [3.0, 0.0]])
+    state = step(reset(problem), np.array([0, 2], np.int32)).state
+    assert (float(state.now), state.solved.tolist()) == (2.0, [True, False])
+    assert world.free(state).tolist() == [True, True]
+
+
 def test_news_wakes_who_is_free_and_what_lapses_ends_it():
     window = {"appears": np.array([0, 7], np.float32), "shown": np.array([0, 4], np.float32),
               "lapses": np.array([FAR, 8], np.float32)}

@@ -230,24 +230,30 @@ def _way_home(problem: MacroProblem, node: Array) -> Array:
 def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
     """To the next moment at which somebody is free, or the end; and whether it can only fail.
 
-    Event by event: services that can start do; then time goes on to the next arrival, end of a
-    service or appearance. `moved` [] bool: the present moment is such a one.
+    Event by event: time goes on to the next arrival, end of a service or appearance, then services
+    that can start do, so that nobody decides while others stand where they are about to serve.
+    `moved` [] bool: the present moment is such a one.
     """
+    def begun(state: MacroState) -> tuple[MacroState, Array]:
+        started = _start(state)
+        return started, jnp.any(started.solved & ~state.solved)
+
     def waits(carry: tuple) -> Array:
-        state, dead, moved = carry
-        decide = moved & jnp.any(free(state)) & jnp.any(open_targets(state))
+        state, dead, moved, again = carry
+        decide = moved & ~again & jnp.any(free(state)) & jnp.any(open_targets(state))
         return ~(jnp.all(state.solved) | dead | decide)
 
     def event(carry: tuple) -> tuple:
-        state, _, _ = carry
-        started = _start(state)
-        instant = jnp.any(started.solved & ~state.solved)
-        later, dead = _advance(started)
-        # A service without length sets its agents free at once: no time passes.
-        after = jax.tree.map(lambda a, b: jnp.where(instant, a, b), started, later)
-        return after, dead & ~instant, jnp.array(True)
+        state, _, _, again = carry
+        later, dead = _advance(state)
+        # A service without length sets its agents free at once, and what comes after it can start.
+        state = jax.tree.map(lambda a, b: jnp.where(again, a, b), state, later)
+        started, again_now = begun(state)
+        return started, dead & ~again, jnp.array(True), again_now
 
-    state, dead, _ = jax.lax.while_loop(waits, event, (state, jnp.array(False), moved))
+    first, again = begun(state)
+    start = first, jnp.array(False), moved | again, again
+    state, dead, _, _ = jax.lax.while_loop(waits, event, start)
     return state, dead
 
 
