@@ -254,7 +254,7 @@ class TimedExecution:
             self.errands[robot].choice = choice
             return
         place = home if choice == HOME else self.task.spot(
-            self.roads, robot, choice, self.task.helpers(self.known.mask, choice, robot))
+            self.roads, robot, choice, self.known.mask, self.known.xy, self.errands)
         assert place is not None
         self._send(robot, choice, place)
 

@@ -16,7 +16,14 @@ from sim2grid.clock.errand import Errand
 from sim2grid.clock.roads import Roads
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body
+from sim2grid.loop.rules import metres
 from sim2grid.waypoints import SLOTS
+
+FARTHER = 1.9
+"""Times as far out as the quarters are four more places, for when those are taken or closed."""
+
+CLOSE = 0.9
+"""Of two footprints: places that are nearer to each other are not for both."""
 
 
 class Task(OnGround):
@@ -26,6 +33,7 @@ class Task(OnGround):
         super().__init__(mission, [body.speed for body in bodies],
                          [body.settle for body in bodies])
         self._frame = frame
+        self._footprints = np.array([body.footprint for body in bodies])
         self._grounded = np.array([not body.flies for body in bodies])
 
     def as_it_stands(self, roads: Roads, xy: Floats, speeds: Floats, errands: Sequence[Errand],
@@ -47,21 +55,29 @@ class Task(OnGround):
                 moment.start[i, errand.choice] = 0
         return moment
 
-    def spot(self, roads: Roads, robot: int, target: int, mates: Bools) -> Floats:
+    def spot(self, roads: Roads, robot: int, target: int, present: Bools, xy: Floats,
+             errands: Sequence[Errand]) -> Floats:
         """Where a robot stands at a target [2] m: in its middle, or in a quarter of its own.
 
-        `mates` [R] are the other robots that may stand there with it. Who flies keeps to the
-        middle, and so does who needs nobody's help and has none.
+        Who flies keeps to the middle, and so does who needs nobody's help and has none. Nobody is
+        sent where another on the ground stands or lies (`xy` [R, 2] m, lost where not `present`
+        [R]) or is bound at this target, unless nothing about it is free.
         """
         centre = self.place(self.targets[target].at)
-        if not self._grounded[robot] or not (mates & self._grounded).any():
+        if not self._grounded[robot]:
             return centre
-        rank = int((mates & self._grounded)[:robot].sum())
-        own = self._frame.cell_m * SLOTS
-        places = [centre + own[(rank + k) % len(own)] for k in range(len(own))]
-        kind = self.kinds[robot]
-        return next((p for p in places if not bool(self._frame.off_map(p, 0.0))
-                     and roads.passable(kind, p)), centre)
+        mates = self.helpers(present, target, robot) & self._grounded
+        rank = int(mates[:robot].sum())
+        quarters = self._frame.cell_m * np.roll(SLOTS, -rank % len(SLOTS), axis=0)
+        places = [p for p in (*([] if mates.any() else [centre]), *(centre + quarters),
+                              *(centre + FARTHER * quarters))
+                  if not bool(self._frame.off_map(p, 0.0)) and roads.passable(self.kinds[robot], p)]
+        others = [(k, errands[k].place if present[k] else xy[k])
+                  for k in np.flatnonzero(self._grounded).tolist() if k != robot
+                  and (errands[k].phase != "going" or errands[k].choice == target)]
+        widths = CLOSE * (self._footprints + self._footprints[robot])
+        free = [p for p in places if all(metres(p - at) >= widths[k] for k, at in others)]
+        return next(iter(free or places), centre)
 
     def helpers(self, present: Bools, target: int, robot: int) -> Bools:
         """[R] those `present` [R] beside this one that may have to stand at a target with it."""

@@ -199,6 +199,28 @@ def test_nobody_walks_into_a_robot_that_stands(mission, drive):
     assert np.linalg.norm(xy[:, 0] - xy[:, 1], axis=-1).min() > 0.55
 
 
+def test_each_of_a_large_coalition_has_a_place_of_its_own(mission, drive):
+    """Five that may help, four quarters: no two are sent to one place, lost ones out of it."""
+    team = [ROVER | {"name": f"r{i}", "start": [2 * i, 0]} for i in range(5)]
+    spec = mission(team, [{"at": [5, 6], "coalition": {"A": 4}, "service": 2}],
+                   events=[{"at_s": 2, "lost": "r3"}])
+    done = drive(spec, (0, (0, 1, 2, 4)))
+    assert done.record.success
+    at = done.known.xy[[0, 1, 2, 4]]
+    apart = np.linalg.norm(at[:, None] - at[None], axis=-1)[np.triu_indices(4, 1)]
+    assert apart.min() > 0.3
+
+
+def test_a_place_that_somebody_lies_in_is_left_to_it(mission, drive):
+    """The first that comes is lost in the middle of the target; the second stands beside it."""
+    second = ROVER | {"name": "second", "start": [11, 0]}
+    spec = mission([ROVER, second], [{"at": [5, 0], "skills": ["A"], "service": 30}],
+                   events=[{"at_s": 15, "lost": "rover"}])
+    done = drive(spec, (0, (0,)), spare=(0, (1,)))
+    assert done.record.success
+    assert 0.3 < np.hypot(*(done.known.xy[1] - done.known.xy[0])) < 1.0
+
+
 def test_the_same_mission_twice_is_the_same(mission, drive):
     spec = mission([ROVER, WALKER, HOPPER], [
         {"at": [6, 6], "skills": ["A", "B"], "type": "AND", "service": 3},
