@@ -82,10 +82,8 @@ def _finite(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:  # Python reads 4300 digits
-        raise _Refused(f"the number {_short(text)} is too large") from None
+    _finite(text)  # what no float holds fails wherever it is reckoned with
+    return int(text)
 
 
 def _short(text: str) -> str:

@@ -70,6 +70,7 @@ def more(value, key, **said):
     (DEMO | {"map": {"size": [1024, 1024]}, "targets": [
         {"at": [i % 30, i // 30], "skills": ["A"]} for i in range(300)]}, "map.size: [1024, 1024]"),
     (DEMO | {"events": [{"at_decision": 10**30, "lost": "a"}]}, "1 to 100000"),
+    (more(DEMO, "targets", at=[10**400, 15]), "the number 100000000000..., 401 characters is too"),
 ], ids=lambda value: value[:30] if isinstance(value, str) else "")
 def test_missions(tmp_path, value, line):
     path = tmp_path / "m.yaml"
