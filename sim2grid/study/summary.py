@@ -24,7 +24,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from moonteam.report.intervals import Bootstrap, Figure
+from moonteam.report.intervals import NOTHING, Bootstrap, Figure, wilson
 from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import Report, RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
@@ -75,8 +75,8 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
     decisions = values(lambda row: row.report.decisions, won)
     sent = values(lambda row: sum(map(legs_sent, row.report.robots)))
     figures = {
-        "success": boot.mean(won.astype(float)),
-        "success_solvable": boot.ratio(won & able, able),
+        "success": _share(int(won.sum()), len(rows)),
+        "success_solvable": _share(int((won & able).sum()), int(able.sum())),
         "seconds": boot.mean(seconds),
         "decisions": boot.mean(decisions),
         "moves": boot.mean(values(lambda row: row.report.moves, won)),
@@ -114,6 +114,10 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
     }
 
 
+def _share(hits: int, count: int) -> Figure:
+    return Figure(hits / count, *wilson(hits, count)) if count else NOTHING
+
+
 def _a_robot(row: Row, key: str) -> float | None:
     """A figure of the robots' reports, in the mean of the robots."""
     return _mean([getattr(robot, key) for robot in row.report.robots])
@@ -148,8 +152,8 @@ def failures(rows: Sequence[Row]) -> dict[str, list[int]]:
 
 def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Contender],
             seed: int) -> list[dict[str, Any]]:
-    """Async over barrier, and another engine over the native one: seconds and moves on the
-    missions that both solved.
+    """Async over barrier, and another engine over the native one: seconds, their difference
+    mission by mission, and moves on the missions that both solved.
     """
     found = []
     for (site, site_seed, name), rows in groups.items():
@@ -164,6 +168,7 @@ def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Co
             figures = {key: boot.ratio(*zip(*((getattr(a, key), getattr(b, key))
                                               for a, b in both), strict=True))
                        for key in ("seconds", "moves")}
+            figures["seconds_more"] = boot.mean([a.seconds - b.seconds for a, b in both])
             found.append({
                 "site": site, "site_seed": site_seed, "contender": name, "over": other,
                 "missions": len(pairs), "both_solved": len(both),
@@ -227,7 +232,7 @@ def _why(row: Row, twin: Row) -> str:
 def notes(options: dict[str, Any]) -> list[str]:
     """What must be known to read the tables."""
     found = ["seconds, decisions, energy: means over the missions that succeeded; brackets: 95 % "
-             "bootstrap intervals over missions",
+             "bootstrap intervals over missions, of success Wilson's",
              "decisions / plan: over those of the same planner on the grid alone; seconds / ideal: "
              "over the grid plan at travelling speed"]
     found += [LACKS] if "fused" in options.get("backend", ()) else []
@@ -250,7 +255,7 @@ TIME_SPENT = ["site", "planner", "s of a mission", "a robot drives, by the groun
 or done.
 """
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
-            "seconds, ratio", "moves, ratio"]
+            "seconds, ratio", "seconds more", "moves, ratio"]
 DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what differs"]
 """Titles of the comparisons and of the differences between engines."""
 
@@ -307,7 +312,7 @@ def compared_rows(report: dict[str, Any], write: Callable[[dict[str, Any], str, 
     """Cells under `COMPARED`; `write` makes one of a figure with its interval, as `spread` does."""
     return [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
              f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
-             write(c, "seconds", 3), write(c, "moves", 3)] for c in report["comparisons"]]
+             write(c, "seconds", 3), write(c, "seconds_more", 2), write(c, "moves", 3)] for c in report["comparisons"]]
 
 
 def different_rows(report: dict[str, Any]) -> list[list[Any]]:
