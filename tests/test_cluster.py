@@ -1,5 +1,6 @@
 """Pieces on a Ray cluster: the same reports and runs, whatever is killed; no Ray without --on."""
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -184,6 +185,71 @@ def test_missions_are_the_same_though_a_worker_is_killed(tmp_path):
     assert sorted(rows[0].splitlines()) == sorted(rows[1].splitlines())
     (tmp_path / "away" / "rows.jsonl").write_text(rows[1].splitlines(True)[0])
     assert finished(moonteam(*words, "--out", tmp_path / "away", "--resume"))[0] == here
+
+
+def free_ports(count):
+    """Ports that nobody listens at."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    found = [one.getsockname()[1] for one in sockets]
+    for one in sockets:
+        one.close()
+    return found
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    """Addresses of a cluster that stands by itself: of its head, and of its client server."""
+    folder = tmp_path_factory.mktemp("head")
+    own, client, agent, grpc = free_ports(4)
+    command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block",
+               "--port", own, "--ray-client-server-port", client, "--num-cpus", 2,
+               "--dashboard-agent-listen-port", agent, "--dashboard-agent-grpc-port", grpc,
+               "--object-store-memory", 200 * 2**20, "--include-dashboard", "false",
+               "--node-ip-address", "127.0.0.1", "--disable-usage-stats"]
+    with open(folder / "log", "w", encoding="utf-8") as log:
+        child = subprocess.Popen([*map(str, command)], env=ALONE, stdout=log, stderr=log,
+                                 cwd=folder, start_new_session=True)
+    try:
+        for port in (own, client):
+            answers(port, child, folder / "log")
+        yield f"127.0.0.1:{own}", f"ray://127.0.0.1:{client}"
+    finally:
+        child.terminate()
+        try:
+            child.wait(60)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+
+
+def answers(port, child, log):
+    deadline = time.monotonic() + 300
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port), 1).close()
+        except OSError:
+            assert child.poll() is None, log.read_text()
+            assert time.monotonic() < deadline, log.read_text()
+            time.sleep(0.2)
+
+
+ENGINES = {"native mjx": ("--planner", "exact", "--lose", "0.5", "--backend", "native", "mjx"),
+           "fused": ("--planner", "policy", "--backend", "fused")}
+
+
+@needs_ray
+@pytest.mark.soak
+@pytest.mark.parametrize("engines", ENGINES)
+def test_missions_are_the_same_on_a_cluster_that_stands_by_itself(tmp_path, head, engines):
+    """By its head's address and by its client port, the workers not being the command's own."""
+    words = ["evaluate", "execution", "--site", "flat", "--count", "4", "--width", "2", "--side",
+             "4", "--targets", "1", *ENGINES[engines], "--json"]
+    here, _ = finished(moonteam(*words, "--out", tmp_path / "here"))
+    rows = (tmp_path / "here" / "rows.jsonl").read_text().splitlines()
+    for number, address in enumerate(head):
+        out = tmp_path / str(number)
+        assert finished(moonteam(*words, "--out", out, "--on", address))[0] == here
+        assert sorted((out / "rows.jsonl").read_text().splitlines()) == sorted(rows)
 
 
 @needs_ray

@@ -312,7 +312,8 @@ def compared_rows(report: dict[str, Any], write: Callable[[dict[str, Any], str, 
     """Cells under `COMPARED`; `write` makes one of a figure with its interval, as `spread` does."""
     return [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
              f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
-             write(c, "seconds", 3), write(c, "seconds_more", 2), write(c, "moves", 3)] for c in report["comparisons"]]
+             write(c, "seconds", 3), write(c, "seconds_more", 2), write(c, "moves", 3)]
+            for c in report["comparisons"]]
 
 
 def different_rows(report: dict[str, Any]) -> list[list[Any]]:

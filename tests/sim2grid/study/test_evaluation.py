@@ -324,6 +324,22 @@ def test_on_the_engine_a_mission_does_not_depend_on_its_company():
     assert alone.sorted_rows()[2] == rows[2]
 
 
+@pytest.mark.soak
+def test_both_engines_tell_the_same_of_many_missions(capsys):
+    """A small version of the 200 missions in docs/results.md: success and seconds agree."""
+    words = ["evaluate", "execution", "--site", "highland", "--side", "8", "--targets", "3",
+             "--lose", "0.3", "--count", "20", "--planner", "exact", "--width", "20", "--json"]
+    assert main([*words, "--backend", "native", "mjx"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    native, mjx = report["summary"]
+    (low, high), (least, most) = (line["intervals"]["success"] for line in (native, mjx))
+    assert max(low, least) <= min(high, most)
+    (compared,) = report["comparisons"]
+    assert compared["only_this"] + compared["only_other"] <= 1
+    low, high = compared["intervals"]["seconds_more"]
+    assert -0.02 * native["seconds"] < low <= high < 0.02 * native["seconds"]
+
+
 def test_the_fused_backend_stands_in_the_table_or_says_what_it_takes(capsys):
     words = ["evaluate", "execution", "--site", "flat", "--side", "4", "--targets", "1",
              "--count", "2", "--width", "2", "--json"]
