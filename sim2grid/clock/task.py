@@ -59,21 +59,20 @@ class Task(OnGround):
              errands: Sequence[Errand]) -> Floats:
         """Where a robot stands at a target [2] m: in its middle, or in a quarter of its own.
 
-        Who flies keeps to the middle, and so does who needs nobody's help and has none. Nobody is
-        sent where another on the ground stands or lies (`xy` [R, 2] m, lost where not `present`
-        [R]) or is bound at this target, unless nothing about it is free.
+        Who needs nobody's help, or has none of its like, those on the ground or those that fly,
+        keeps to the middle. Nobody is sent where another of its like stands or lies (`xy` [R, 2] m,
+        lost where not `present` [R]) or is bound at this target, unless nothing about it is free.
         """
         centre = self.place(self.targets[target].at)
-        if not self._grounded[robot]:
-            return centre
-        mates = self.helpers(present, target, robot) & self._grounded
+        alike = self._grounded == self._grounded[robot]
+        mates = self.helpers(present, target, robot) & alike
         rank = int(mates[:robot].sum())
         quarters = self._frame.cell_m * np.roll(SLOTS, -rank % len(SLOTS), axis=0)
         places = [p for p in (*([] if mates.any() else [centre]), *(centre + quarters),
                               *(centre + FARTHER * quarters))
                   if not bool(self._frame.off_map(p, 0.0)) and roads.passable(self.kinds[robot], p)]
         others = [(k, errands[k].place if present[k] else xy[k])
-                  for k in np.flatnonzero(self._grounded).tolist() if k != robot
+                  for k in np.flatnonzero(alike).tolist() if k != robot
                   and (errands[k].phase != "going" or errands[k].choice == target)]
         widths = CLOSE * (self._footprints + self._footprints[robot])
         free = [p for p in places if all(metres(p - at) >= widths[k] for k, at in others)]

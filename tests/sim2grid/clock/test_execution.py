@@ -211,6 +211,19 @@ def test_each_of_a_large_coalition_has_a_place_of_its_own(mission, drive):
     assert apart.min() > 0.3
 
 
+def test_two_that_fly_have_a_place_each_above_who_stands(mission, drive):
+    second = HOPPER | {"name": "second", "start": [0, 11]}
+    spec = mission([HOPPER, second, ROVER],
+                   [{"at": [6, 6], "coalition": {"C": 2, "A": 1}, "service": 2}])
+    done = drive(spec, (0, (0, 1, 2)))
+    assert done.record.success
+    xy = np.concatenate(done.record.qpos).reshape(-1, 3, 7)[:, :, :2]
+    assert np.linalg.norm(xy[:, 0] - xy[:, 1], axis=-1).min() > 0.35
+    hopper, second, rover = done.record.solves[0].distance_m
+    assert max(hopper, second) < 0.57
+    assert rover <= 0.25  # nobody of its like is there
+
+
 def test_a_place_that_somebody_lies_in_is_left_to_it(mission, drive):
     """The first that comes is lost in the middle of the target; the second stands beside it."""
     second = ROVER | {"name": "second", "start": [11, 0]}
