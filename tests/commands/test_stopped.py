@@ -12,6 +12,7 @@ import time
 
 import pytest
 
+from tests import killed
 from tests.killed import kill_once
 from tests.signalled import begins
 
@@ -43,14 +44,10 @@ class Child:
             self.when.append(time.monotonic())
 
     def worked(self):
-        """CPU s so far, which other processes cannot lengthen; after its end, without end."""
-        try:
-            with open(f"/proc/{self.process.pid}/stat", encoding="utf-8") as file:
-                user, system = file.read().rpartition(")")[2].split()[11:13]
-        except OSError:
+        """CPU s so far; after its end, without end."""
+        if self.process.poll() is not None:
             return math.inf
-        return math.inf if self.process.poll() is not None else (
-            (int(user) + int(system)) / os.sysconf("SC_CLK_TCK"))
+        return killed.worked(self.process.pid)
 
     def answer(self, number, ready):
         """Sends a signal once it is `ready()`; (s to its answer, exit code, what it said)."""
