@@ -22,8 +22,10 @@ from sim2grid.waypoints import SLOTS
 FARTHER = 1.9
 """Times as far out as the quarters are four more places, for when those are taken or closed."""
 
-CLOSE = 0.9
-"""Of two footprints: places that are nearer to each other are not for both."""
+CLOSE = 0.75
+"""Of two footprints: places that are nearer to each other are not for both. Opposite quarters of a
+cell of a metre are for any two of our kinds, neighbouring ones for none.
+"""
 
 
 class Task(OnGround):
