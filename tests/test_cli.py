@@ -2,11 +2,12 @@
 
 import importlib
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from moonteam import cli, files, paths
+from moonteam import cli, files, loading, paths
 from moonteam.errors import InputError
 
 
@@ -61,3 +62,21 @@ def test_bundled_assets_are_found_by_name(tmp_path):
         paths.find("nowhere", "missions", ".yaml")
     with pytest.raises(InputError, match="no such file"):
         paths.find(str(tmp_path / "x.yaml"), "missions", ".yaml")
+    with pytest.raises(InputError, match=r"did you mean outpost\?$"):
+        paths.find("outpots", "missions", ".yaml")
+
+
+def test_a_folder_does_not_stand_before_a_bundled_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("demo", "any_team", "3x5", "mine"):
+        (tmp_path / name).mkdir()
+    assert paths.find("demo", "missions", ".yaml").parent.name == "missions"
+    assert paths.find("any_team", "policies", ".safetensors").is_file()
+    assert loading.load("demo").name == "demo"
+    assert len(loading.load("3x5")) == 1000
+    assert loading.load("3x5:2").id == loading.load("3x5")[2].id
+    with pytest.raises(InputError, match=r"^mine: is a folder, and not one of"):
+        loading.load("mine")
+    (tmp_path / "demo").rmdir()
+    (tmp_path / "demo").write_text("{}")
+    assert paths.find("demo", "missions", ".yaml") == Path("demo")  # a file of one's own does

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
 from moonteam.cluster import Cluster, cluster
-from moonteam.commands.options import Apart, Missions, Planning, Reported, Resumable
+from moonteam.commands.options import Apart, Elevation, Missions, Planning, Reported, Resumable
+from moonteam.errors import InputError
 from moonteam.report import command, journal
 from moonteam.report.command import Aside
 from moonteam.report.journal import Journal
@@ -17,19 +19,26 @@ from moonteam.report.progress import say
 
 if TYPE_CHECKING:
     from sim2grid.study.evaluation import Evaluation, Row
+    from sim2grid.study.fleet import Given, Recipe
 
 PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
+
+DRAWN = ("team", "site", "count", "cell", "lose", "slow", "silent", "new_targets", "impassable",
+         "site_seed", "targets", "side", "max_steps", "dem", "centre", "units", "rotation", "pixel",
+         "band", "scale", "detrend", "detail")
+"""Options of random missions, which a mission that is given answers itself."""
 
 FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")
 """In --out."""
 
 
 @dataclass(frozen=True)
-class Args(Planning, Missions, Apart, Resumable, Reported):
-    """Execute random missions in physics and compare what they cost with the grid's promise.
+class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
+    """Execute missions in physics and compare what they cost with the grid's promise.
 
-    Each mission has one robot of each of our own kinds with random skills, random targets
-    and, if asked for, random events; all missions of a site stand on the same ground. A row of
+    Missions are those of --mission, or random: one robot of each of our own kinds, or the --team,
+    random skills where that says none, random targets and, if asked for, random events, all of a
+    site on the same ground, which may be that of a --dem. A row of
     the table is a loop with a planner and a mode: closed (the planner decides again at each
     step, from where the robots really are), open (the grid plan walked through blindly, all
     robots in lockstep), oracle (closed with the exact planner) and grid (no physics).
@@ -45,11 +54,20 @@ class Args(Planning, Missions, Apart, Resumable, Reported):
       moonteam evaluate execution --site flat --count 8 --lose 1 --out runs/lose --resume
       moonteam evaluate execution --backend native mjx --count 10 --out runs/backends
       moonteam evaluate execution --count 20 --new-targets 5 --slow 0.5 --silent 0.5 --json
+      moonteam evaluate execution --mission outpost my_mission.yaml --planner exact policy
+      moonteam evaluate execution --team drone:A,my_rover.py:ROVER:AB --planner my.py:Planner
+      moonteam evaluate execution --dem moon.tif --units degrees --centre -89.4 222 --side 24
       moonteam evaluate execution --count 500 --on ray://head:10001 --out runs/many
     """
 
+    mission: tuple[str, ...] = ()
+    """Mission files or names of bundled missions, each executed once, in place of random ones."""
+    team: str = ""
+    """The robots of random missions, KIND or KIND:SKILLS, with commas: drone:A,wheeled:AB or
+    rover.py:ROVER:drill+camera. Kinds are registered or FILE.py:OBJECT; skills that are left out
+    are drawn."""
     site: tuple[Literal["mare", "highland", "crater_rim", "polar", "flat"], ...] = ("mare",)
-    """Presets of the ground, one group of missions each."""
+    """Presets of the ground, one group of missions each; without --dem."""
     count: int = 20
     """Missions a site."""
     loop: tuple[Literal["closed", "open", "oracle", "grid"], ...] = ("closed",)
@@ -60,8 +78,7 @@ class Args(Planning, Missions, Apart, Resumable, Reported):
     policies that do not point at targets)."""
     planner: tuple[str, ...] = ("policy",)
     """Who decides: registered planners (policy, auto, exact, greedy, lns, cpsat, exhaustive,
-    another package's), or
-    FILE.py:OBJECT."""
+    another package's), or FILE.py:OBJECT, which decides in steps or by the clock, as it can."""
     cell: float = 1.0
     """Metres a side of a cell."""
     lose: float = 0.0
@@ -102,6 +119,7 @@ def _run(args: Args, workers: Cluster | None) -> int:
 
     evaluation = _evaluation(args)
     evaluation.cluster = workers
+    evaluation.prepare()  # refuses what cannot be run before anything is written
     if args.out:
         held = Journal[Row](args.out, args.resume, _options(args), Row, FILES)
         evaluation.rows |= {(row.contender, row.number): row for row in held.entries}
@@ -134,20 +152,74 @@ def _check(args: Args) -> None:
 
 
 def _evaluation(args: Args) -> Evaluation:
-    from sim2grid.study.evaluation import Contender, Evaluation, contenders
-    from sim2grid.study.fleet import Rates, Recipe
+    from sim2grid.study.evaluation import Evaluation, contenders, deciders
 
+    recipes = _given(args) if args.mission else _recipes(args)
+    # The plans of these loops are made in steps, whatever the modes of the others.
+    modes = args.mode if not {"open", "grid"} & {*args.loop} else (*args.mode, "barrier")
+    who = [deciders(name, args.planner_options(), modes) for name in args.planner]
+    rows = contenders(args.loop, args.mode, [steps for steps, _ in who if steps], args.backend,
+                      [timed for _, timed in who if timed])
+    if not rows:
+        raise InputError("--planner", f"nobody of {', '.join(args.planner)} decides in these modes "
+                         "and loops")
+    return Evaluation(recipes, 1 if args.mission else args.count, rows, args.seed, args.width,
+                      args.threads)
+
+
+def _recipes(args: Args) -> list[Recipe]:
+    """Random missions, a recipe for each ground. Raises InputError."""
+    from moonteam.problem.mission import Site
+    from sim2grid.study.fleet import TEAM, Rates, Recipe, parse_team
+
+    if args.dem is None:
+        for name in args.model_options():
+            raise InputError(command.flag(name), "is for an elevation model; give --dem too")
+    if args.dem is not None and args.site != Args().site:
+        raise InputError("--site", "give presets or an elevation model, not both; it has --dem")
+    team, skills = parse_team(args.team) if args.team else (TEAM, ())
     rates = Rates(args.lose, args.slow, args.silent, args.new_targets, args.impassable)
-    recipes = [Recipe(site, args.site_seed, args.seed, args.targets, args.side, args.cell,
-                      args.max_steps, rates) for site in args.site]
-    who = [Contender.of(name, args.planner_options()) for name in args.planner]
-    return Evaluation(recipes, args.count, contenders(args.loop, args.mode, who, args.backend),
-                      args.seed, args.width, args.threads)
+    grounds: list[tuple[str, Site | None]] = [(site, None) for site in args.site]
+    if args.dem is not None:
+        grounds = [(args.dem.stem, Site(
+            None, os.fspath(args.dem.resolve()), args.site_seed, args.centre, None, args.units,
+            args.rotation, args.pixel, args.band, args.scale, args.detrend, args.detail))]
+    # The exact planner, whose plans say which missions can be, takes 6 robots.
+    return [Recipe(name, args.site_seed, args.seed, args.targets, args.side, args.cell,
+                   args.max_steps, rates, team, "exact" if len(team) <= 6 else "greedy", skills,
+                   ground) for name, ground in grounds]
+
+
+def _given(args: Args) -> list[Given]:
+    """The missions that were given. Raises InputError for what cannot go with them."""
+    from moonteam.loading import load_mission
+    from sim2grid.clock.prepare import by_the_clock
+    from sim2grid.study.fleet import Given
+
+    usual = Args()
+    for name in DRAWN:
+        if getattr(args, name) != getattr(usual, name):
+            raise InputError(command.flag(name), "is for random missions; those of --mission say "
+                             "it themselves")
+    if len(set(args.mission)) < len(args.mission):
+        raise InputError("--mission", "give each once")
+    for name in args.mission:
+        mission = load_mission(name)
+        if "clock" in args.mode:
+            by_the_clock(mission, name)
+        if mission.clock == "seconds" and ({*args.mode} != {"clock"} or {*args.loop} != {"closed"}):
+            raise InputError(name, "is by the clock, which --mode clock --loop closed alone "
+                             "executes", "clock")
+    return [Given(name) for name in args.mission]
 
 
 def _options(args: Args) -> dict[str, Any]:
     """What the rows depend on; the same in a run and in what resumes it."""
     options = command.figures(args)
+    if args.dem is not None:
+        options["dem"] = os.fspath(args.dem)
+    if args.mission:
+        options["count"] = 1  # of each
     rates = {name: options.pop(name)
              for name in ("lose", "slow", "silent", "new_targets", "impassable")}
     return options | {"rates": rates}

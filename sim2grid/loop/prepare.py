@@ -59,7 +59,7 @@ def prepare(mission: Mission, source: object) -> Prepared:
     written = mission
     mission, kinds = team.resolve(written, source)
     frame = Frame(mission.map.size, mission.map.cell_m)
-    site = for_mission(mission)
+    site = for_mission(mission, source=source)
     passable = passable_cells(site, mission, team.limits(kinds))
     for i, robot in enumerate(mission.robots):
         x, y = robot.cell

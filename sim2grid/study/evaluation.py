@@ -54,7 +54,7 @@ from sim2grid.loop.record import Record
 from sim2grid.loop.rules import Rules
 from sim2grid.measure.metrics import GridPlan, Report, make_report
 from sim2grid.measure.slip import ground_height
-from sim2grid.study.fleet import Fleet, Rates, Recipe, make_fleet
+from sim2grid.study.fleet import Fleet, Given, Recipe, make_fleet
 from sim2grid.study.ideal import (
     IdealBackend,
     ideal_bodies,
@@ -83,9 +83,12 @@ class Contender(msgspec.Struct, frozen=True):
     preference: float = 0.0  # of a policy
 
     @classmethod
-    def of(cls, planner: str, options: PlannerOptions) -> Contender:
-        """A planner with what concerns it of its options. Raises InputError for none such."""
-        kind = registry.find(planner)
+    def of(cls, planner: str, options: PlannerOptions, by_the_clock: bool = False) -> Contender:
+        """A planner, in steps or by the clock, with what concerns it of its options.
+
+        Raises InputError for none such.
+        """
+        kind = timed_planners.find(planner) if by_the_clock else registry.find(planner)
         if not kind.wants_policy:
             limit = options.time_limit if kind.anytime else None
             return cls("closed", "barrier", planner, objective=options.goal[0],
@@ -169,8 +172,8 @@ class Evaluation:
     `rows` holds what is done, by contender and number; `keep` is called with each new row.
     """
 
-    recipes: Sequence[Recipe]
-    count: int  # missions a site
+    recipes: Sequence[Recipe | Given]
+    count: int  # missions a site; 1 where missions are given
     contenders: Sequence[Contender]
     seed: int = 0
     width: int = 25  # B
@@ -180,18 +183,24 @@ class Evaluation:
     entries: list[Entry] = field(default_factory=list)
     label: str = ""  # before what the progress bar is called
     cluster: Cluster | None = None  # where missions are run; None: in this process
+    _fleets: list[Fleet] = field(default_factory=list)
+
+    def prepare(self) -> None:
+        """Draws the missions. Raises InputError before a mission that cannot be run."""
+        self._check_fused()
+        self._fleets = [make_fleet(recipe, self.count) for recipe in self.recipes]
+        self.entries = [Entry(index * self.count + k, draws, fleet.entry(k))
+                        for index, fleet in enumerate(self._fleets)
+                        for k, draws in enumerate(fleet.draws)]
 
     def run(self) -> None:
         """Runs what is not done yet. Raises InputError before a mission that cannot be run."""
-        self._check_fused()
-        fleets = [make_fleet(recipe, self.count) for recipe in self.recipes]
-        for index, fleet in enumerate(fleets):
-            self.entries += [Entry(index * self.count + k, fleet.draws[k], mission)
-                             for k, mission in enumerate(fleet.missions)]
+        if not self._fleets:
+            self.prepare()
         if self.cluster is not None:
             self._run_on(self.cluster)
             return
-        for index, fleet in enumerate(fleets):
+        for index, fleet in enumerate(self._fleets):
             Group(self, fleet, index * self.count).run()
 
     def todo(self, contender: Contender, first: int) -> list[int]:
@@ -232,7 +241,7 @@ class Evaluation:
             if contender.backend != "fused":
                 continue
             decider_of(maker(contender)())
-            if any(recipe.rates != Rates() for recipe in self.recipes):
+            if any(recipe.eventful() for recipe in self.recipes):
                 raise InputError("--backend fused", "takes missions without events; the other "
                                  "backends take them: native, mjx")
 
@@ -284,7 +293,8 @@ class Group:
         """Runs missions in physics and keeps their rows."""
         done = len(self._fleet.missions) - len(todo)
         total = len(self._fleet.missions)
-        title = f"{self._all.label}{self._fleet.site.name}: {contender.name}"
+        name = self._fleet.missions[0].name if self._fleet.label else self._fleet.site.name
+        title = f"{self._all.label}{name}: {contender.name}"
 
         def finished(index: int) -> None:
             nonlocal done
@@ -361,11 +371,11 @@ class Group:
 
     def _keep(self, contender: Contender, k: int, report: Report, nominal_s: float | None
               ) -> None:
-        recipe = self._fleet.missions[k].site
+        site, site_seed = self._fleet.place
         losses = {robot.lost for robot in report.robots if robot.lost}
         by_event = report.cause == "unsolvable" and losses == {"event"}
-        row = Row(number=self._first + k, contender=contender.name, site=recipe.preset or "",
-                  site_seed=recipe.seed, seed=report.seed, slot=k % self._width,
+        row = Row(number=self._first + k, contender=contender.name, site=site,
+                  site_seed=site_seed, seed=report.seed, slot=k % self._width,
                   solvable=not by_event, nominal_s=nominal_s, report=report)
         self._all.add(row)
 
@@ -380,15 +390,15 @@ class Group:
 
 
 @cache
-def _group(recipe: Recipe, first: int, count: int, seed: int, width: int
+def _group(recipe: Recipe | Given, first: int, count: int, seed: int, width: int
            ) -> tuple[Evaluation, Group]:
     """In a worker: a site's missions, kept with their engines for the pieces to come."""
     whole = Evaluation([recipe], count, [], seed, width, threads=1)
     return whole, Group(whole, make_fleet(recipe, count), first)
 
 
-def played(recipe: Recipe, first: int, count: int, seed: int, width: int, contender: Contender,
-           todo: list[int]) -> list[Row]:
+def played(recipe: Recipe | Given, first: int, count: int, seed: int, width: int,
+           contender: Contender, todo: list[int]) -> list[Row]:
     """The rows of some missions by one contender, a pure function of all these.
 
     Args:
@@ -449,23 +459,59 @@ def chooser(contender: Contender) -> Keeper:
     return Keeper(timed_planners.find(contender.planner).make(contender.options))
 
 
-def points(who: Contender) -> bool:
-    """Whether it can decide by the clock: all planners but policies of other kinds can."""
-    if who.planner != "policy":
+def deciders(name: str, options: PlannerOptions, modes: Sequence[Mode]
+             ) -> tuple[Contender | None, Contender | None]:
+    """A planner as it decides in steps and by the clock, as far as the modes ask for it.
+
+    One of a user's file, or of another package, may be for one of the two alone; of policies those
+    that point at targets decide by the clock. Raises InputError for who decides in none of them.
+    """
+    clock, steps = "clock" in modes, any(mode != "clock" for mode in modes)
+    said, found = [], []
+    for wanted, timed in ((steps, False), (clock, True)):
+        who = None
+        if wanted:
+            try:
+                who = Contender.of(name, options, timed)
+                if not _able(who, timed, clock and steps):
+                    who = None
+            except InputError as error:
+                said.append(error)
+        found.append(who)
+    if not any(found) and said:
+        raise said[0]
+    return found[0], found[1]
+
+
+def _able(who: Contender, timed: bool, both: bool) -> bool:
+    """Whether it decides in steps, or `timed`. Raises InputError for what is no planner of these.
+
+    An object that has what both need is taken by the clock only where nothing else is asked for.
+    """
+    if not timed:
+        if not registry.find(who.planner).wants_policy:
+            maker(who)()
         return True
-    return isinstance(who.options.loaded().brain, PointerBrain)
+    if who.planner == "policy":
+        return isinstance(who.options.loaded().brain, PointerBrain)
+    kind = timed_planners.find(who.planner)
+    planner = who if kind.wants_policy else kind.make(who.options)
+    return not (both and callable(getattr(planner, "act", None)))
 
 
 def contenders(loops: Iterable[Loop], modes: Sequence[Mode], planners: Iterable[Contender],
-               backends: Sequence[str] = ("native",)) -> list[Contender]:
+               backends: Sequence[str] = ("native",),
+               by_the_clock: Iterable[Contender] | None = None) -> list[Contender]:
     """All combinations that mean something, each once; `planners` give who decides.
 
-    By the clock, of policies only those that point at targets decide, and the exact planner stands
-    in where nobody does.
+    By the clock `by_the_clock` decide; None: the same planners, of policies those alone that point
+    at targets. The exact planner stands in where nobody does.
     """
     found: dict[str, Contender] = {}
     planners, exact = list(planners), Contender("oracle", "barrier", "exact")
-    by_the_clock = [who for who in planners if "clock" in modes and points(who)] or [exact]
+    timed = [] if "clock" not in modes else [
+        who for who in planners if _able(who, True, False)] if by_the_clock is None else [
+        *by_the_clock]
     for loop in loops:
         for mode, backend in itertools.product(
                 modes if loop in ("closed", "oracle") else ("barrier",),
@@ -474,7 +520,7 @@ def contenders(loops: Iterable[Loop], modes: Sequence[Mode], planners: Iterable[
                 continue  # it only knows how to decide again, all together
             if loop == "oracle" and mode == "clock":
                 continue  # closed with the exact planner
-            who_decides = by_the_clock if mode == "clock" else planners
+            who_decides = (timed or [exact]) if mode == "clock" else planners
             for who in who_decides if loop != "oracle" else [exact]:
                 one = msgspec.structs.replace(who, loop=loop, mode=mode, backend=backend)
                 if found.setdefault(one.name, one) != one:

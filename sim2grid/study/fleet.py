@@ -10,8 +10,10 @@ Legend: R robots, F missions of a fleet, K kinds.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -19,6 +21,7 @@ import numpy.typing as npt
 
 from moonteam.errors import InputError
 from moonteam.grid import scenarios
+from moonteam.loading import load_mission
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.planners import registry, simulate
 from moonteam.planners.base import IntArray, Plan, Snapshot, WholePlanner
@@ -34,14 +37,14 @@ from moonteam.problem.mission import (
     Slow,
     Target,
 )
-from moonteam.problem.scenario import Scenario
-from moonteam.robots import KINDS, OWN, team
+from moonteam.problem.scenario import MAX_SKILLS, MOST_AGENTS, Scenario
+from moonteam.robots import KINDS, OWN, RobotKind, team
 from moonteam.terrain.site import Site as Ground
 from moonteam.terrain.site import for_mission
 from moonteam.terrain.traversability import passable_cells
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body
-from sim2grid.loop.prepare import bodies_of
+from sim2grid.loop.prepare import bodies_of, prepare
 from sim2grid.loop.replan import grid_problem, unsolvable, with_target
 from sim2grid.waypoints import waypoints
 
@@ -79,13 +82,39 @@ class Recipe:
     cell_m: float = 1.0
     max_steps: int = 128
     rates: Rates = Rates()
-    team: tuple[tuple[str, str], ...] = TEAM  # names and kinds
+    team: tuple[tuple[str, str], ...] = TEAM  # names and kinds, which may be FILE.py:OBJECT
     planner: str = "exact"  # whose plan says that it can be done in time, and when events come
+    skills: tuple[tuple[str, ...], ...] = ()  # of each robot; those of one with none are drawn
+    ground: Site | None = None  # in place of the preset, which then is but its name
 
     @property
     def site(self) -> Site:
         """The ground, as a mission names it."""
-        return Site(preset=self.preset, seed=self.site_seed)
+        return self.ground or Site(preset=self.preset, seed=self.site_seed)
+
+    @property
+    def source(self) -> str:
+        """What its ground is called in messages."""
+        return f"site {self.preset} {self.site_seed}"
+
+    def eventful(self) -> bool:
+        """Whether something may happen in its missions."""
+        return self.rates != Rates()
+
+
+@dataclass(frozen=True)
+class Given:
+    """A mission of a user's, by its file or the name of a bundled one, in place of drawn ones."""
+
+    name: str
+
+    def eventful(self) -> bool:
+        """Whether something happens in it."""
+        return bool(load_mission(self.name).events)
+
+
+GIVEN = "missions"
+"""What stands for the site of missions that were given."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +131,17 @@ class Fleet:
     scene: Scene
     bodies: tuple[Body, ...]
     starts: npt.NDArray[np.float64]  # [F, nq]
+    written: tuple[Mission, ...] = ()  # where a kind may be FILE.py:OBJECT; as `missions` if empty
+    label: str = ""  # in place of the site's name
+
+    @property
+    def place(self) -> tuple[str, int]:
+        """Name and seed of the ground, by which rows are put together."""
+        return (self.label, 0) if self.label else (self.site.name, self.site.seed)
+
+    def entry(self, k: int) -> Mission:
+        """Mission `k` as a file would have it."""
+        return (self.written or self.missions)[k]
 
     @property
     def bases(self) -> tuple[int, ...]:
@@ -109,36 +149,108 @@ class Fleet:
         return tuple(body.base for body in self.bodies)
 
 
-def make_fleet(recipe: Recipe, count: int,
+def parse_team(text: str) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[str, ...], ...]]:
+    """Names with kinds, and skills, of `KIND:SKILLS,KIND:SKILLS,...`.
+
+    A kind is a registered name or FILE.py:OBJECT; skills are capital letters (AB) or names joined
+    by + (drill+camera), or left out, to be drawn. Raises InputError for what is none of this.
+    """
+    names: list[str] = []
+    kinds, skills = [], []
+    for part in text.split(","):
+        file, dot, rest = part.strip().rpartition(".py:")
+        kind, _, said = rest.partition(":")
+        kinds.append(file + dot + kind)
+        skills.append(_skills(said, part) if said or part.rstrip().endswith(":") else ())
+        known = KINDS.get(kinds[-1], "--team")
+        name = known.callsign or known.name
+        count = 1 + sum(other.rstrip("0123456789") == name for other in names)
+        names.append(name if count == 1 else f"{name}{count}")
+    if len({skill for its in skills for skill in its}) > MAX_SKILLS:
+        raise InputError("--team", f"too many different skills; at most {MAX_SKILLS}")
+    if len(kinds) > MOST_AGENTS:
+        raise InputError("--team", f"{len(kinds)} robots; at most {MOST_AGENTS}")
+    return tuple(zip(names, kinds, strict=True)), tuple(skills) if any(skills) else ()
+
+
+def _skills(said: str, part: str) -> tuple[str, ...]:
+    """What stands behind a kind. Raises InputError."""
+    letters = said.isascii() and set(said) <= set(scenarios.LETTERS)
+    found = tuple(said) if letters else tuple(said.split("+"))
+    for skill in found:
+        if not skill.replace("_", "").replace("-", "").isalnum() or found.count(skill) > 1:
+            raise InputError("--team", f"{part.strip()!r} is not allowed; KIND or KIND:SKILLS, "
+                             "skills as letters A to H or names joined by +, each once, such as "
+                             "drone:A,wheeled:AB or rover.py:ROVER:drill+camera")
+    return found or _skills("?", part)
+
+
+def make_fleet(recipe: Recipe | Given, count: int,
                change: Callable[[Ground], Ground] = lambda ground: ground) -> Fleet:
     """The first `count` missions of a recipe, on their ground after a `change`.
 
     Raises InputError for numbers out of range, or ground that allows no mission.
     """
+    if isinstance(recipe, Given):
+        return fleet_of_one(load_mission(recipe.name), recipe.name)
     site, passable = ground_of(recipe, change)
     drawn = [draw_mission(recipe, number, site, passable) for number in range(count)]
-    return fleet_of([m for m, _ in drawn], [n for _, n in drawn], site, passable)
+    chosen, kinds = [mission for mission, _ in drawn], crew(recipe)
+    fleet = fleet_of(chosen, [draws for _, draws in drawn], site, passable, kinds)
+    files = {kinds[i].name: os.fspath(Path(written).resolve())
+             for i, (_, written) in enumerate(recipe.team) if ".py:" in written}
+    return replace(fleet, written=tuple(
+        team.with_kinds(mission, lambda name, _: files.get(name, name)) for mission in chosen))
+
+
+def fleet_of_one(written: Mission, source: object) -> Fleet:
+    """One mission as it was given. Raises InputError, see `prepare`."""
+    its = prepare(written, source)
+    return Fleet((its.mission,), (0,), (its.scenario,), its.frame, its.site, its.passable,
+                 its.kinds, its.scene, its.bodies, its.scene.qpos0[None], (written,), GIVEN)
+
+
+def crew(recipe: Recipe) -> list[RobotKind]:
+    """Each robot's kind. Raises InputError for one that nobody knows."""
+    found = [KINDS.get(kind, "--team") for _, kind in recipe.team]
+    for one in found:
+        other = next(kind for kind in found if kind.name == one.name)
+        if other is not one:
+            raise InputError("--team", f"two different kinds are called {one.name!r}; rename one")
+    return found
 
 
 def ground_of(recipe: Recipe, change: Callable[[Ground], Ground] = lambda ground: ground
               ) -> tuple[Ground, dict[str, BoolArray]]:
-    """The site of a recipe's missions, and [H, W] cells that each kind of the team can cross."""
-    empty = Mission(Map((recipe.side, recipe.side), recipe.cell_m), tuple(
-        Robot(name, kind, ("A",), (0, 0)) for name, kind in recipe.team), (), recipe.site)
+    """The site of a recipe's missions, and [H, W] cells that each kind of the team can cross.
+
+    Raises InputError where there is none, or a robot of the team can be nowhere on it.
+    """
+    kinds = {kind.name: kind for kind in crew(recipe)}
+    empty = Mission(Map((recipe.side, recipe.side), recipe.cell_m), (), (), recipe.site)
     site = change(for_mission(empty))
-    kinds = {kind: KINDS.get(kind) for _, kind in recipe.team}
-    return site, passable_cells(site, empty, team.limits(kinds))
+    passable = passable_cells(site, empty, team.limits(kinds))
+    for name, cells in passable.items():
+        if not cells.any():
+            raise InputError(recipe.source, f"no cell of it is open to a {name} robot (slopes, "
+                             "steps, boulders); other ground or another team is needed")
+    return site, passable
 
 
 def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
-             passable: dict[str, BoolArray]) -> Fleet:
-    """Missions with the same robots by name and kind, on one site."""
+             passable: dict[str, BoolArray], kinds: Sequence[RobotKind] = ()) -> Fleet:
+    """Missions with the same robots by name and kind, on one site.
+
+    `kinds` are those of the robots; without them kinds are registered.
+    """
     frame = Frame(chosen[0].map.size, chosen[0].map.cell_m)
-    scene = build_scene(site, placements(chosen[0], frame))
+    kinds = kinds or [KINDS.get(robot.kind) for robot in chosen[0].robots]
+    scene = build_scene(site, placements(chosen[0], frame, kinds))
     starts = []
     for mission in chosen:
         pose = scene.qpos0.copy()
-        for robot, placement in zip(scene.robots, placements(mission, frame), strict=True):
+        for robot, placement in zip(scene.robots, placements(mission, frame, kinds),
+                                    strict=True):
             pose[robot.qpos] = start_pose(site, placement)
         starts.append(pose)
     return Fleet(tuple(chosen), tuple(draws),
@@ -147,40 +259,59 @@ def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
                  bodies_of(scene), np.stack(starts))
 
 
-def placements(mission: Mission, frame: Frame) -> list[Placement]:
-    """Where the robots of a mission stand at its start."""
+def placements(mission: Mission, frame: Frame, kinds: Sequence[RobotKind]) -> list[Placement]:
+    """Where the robots of a mission, of these kinds, stand at its start."""
     starts = waypoints(frame, np.array([r.cell for r in mission.robots]),
                        np.ones(len(mission.robots), bool))
-    return [Placement(robot.name, KINDS.get(robot.kind), (float(x), float(y)))
-            for robot, (x, y) in zip(mission.robots, starts, strict=True)]
+    return [Placement(robot.name, kind, (float(x), float(y)))
+            for robot, kind, (x, y) in zip(mission.robots, kinds, starts, strict=True)]
 
 
 def draw_mission(recipe: Recipe, number: int, site: Ground,
                  passable: dict[str, BoolArray]) -> tuple[Mission, int]:
     """Mission `number` of a recipe, and how many draws it took. Raises InputError."""
     rng = np.random.default_rng([recipe.seed, recipe.site_seed, number])
-    kinds = [kind for _, kind in recipe.team]
+    kinds, names = crew(recipe), sorted({name for skills in recipe.skills for name in skills})
     planner = registry.make(recipe.planner)
     for draws in range(1, MOST_DRAWS + 1):
-        drawn = scenarios.generate(
+        drawn = _named(scenarios.generate(
             rng, num_agents=len(kinds), num_targets=recipe.num_targets,
-            size=(recipe.side, recipe.side), max_steps=recipe.max_steps, kinds=kinds)
+            num_skills=len(names) or 2, size=(recipe.side, recipe.side),
+            max_steps=recipe.max_steps, kinds=[kind.name for kind in kinds]), names)
         mission = Mission(
             Map(drawn.size, recipe.cell_m),
-            tuple(Robot(name, kind, robot.skills, robot.at) for (name, kind), robot
-                  in zip(recipe.team, drawn.agents, strict=True)),
+            tuple(Robot(name, kind.name, given or robot.skills, robot.at)
+                  for (name, _), kind, given, robot in zip(
+                      recipe.team, kinds, recipe.skills or [()] * len(kinds), drawn.agents,
+                      strict=True)),
             tuple(Target(t.at, t.skills, t.type) for t in drawn.targets),
             recipe.site, f"{recipe.preset}-{recipe.site_seed}-{number}", recipe.max_steps)
-        if plan := _allowed(mission, site, passable, planner):
-            events = _draw_events(recipe.rates, mission, grid_problem(mission, passable), plan, rng)
+        if plan := _allowed(mission, site, passable, planner, kinds):
+            events = _draw_events(recipe.rates, mission, grid_problem(mission, passable), plan,
+                                  rng, kinds)
             done = msgspec.structs.replace(mission, events=events)
             return missions.check(done, done.name), draws
-    raise InputError(f"site {recipe.preset} {recipe.site_seed}",
-                     f"allows none of {MOST_DRAWS} random missions")
+    share = ", ".join(f"{name} {100 * cells.mean():.0f} %" for name, cells in passable.items())
+    raise InputError(recipe.source, f"allows none of {MOST_DRAWS} random missions; cells open to: "
+                     f"{share}")
+
+
+def _named(drawn: Scenario, names: Sequence[str]) -> Scenario:
+    """The scenario with its letters standing for `names`, where there are any."""
+    if not names:
+        return drawn
+
+    def named(skills: Sequence[str]) -> tuple[str, ...]:
+        return tuple(names[scenarios.LETTERS.index(letter)] for letter in skills)
+
+    return msgspec.structs.replace(
+        drawn, agents=tuple(msgspec.structs.replace(a, skills=named(a.skills))
+                            for a in drawn.agents),
+        targets=tuple(msgspec.structs.replace(t, skills=named(t.skills)) for t in drawn.targets))
 
 
 def _allowed(mission: Mission, site: Ground, passable: dict[str, BoolArray],
-             planner: WholePlanner) -> Plan | None:
+             planner: WholePlanner, kinds: Sequence[RobotKind]) -> Plan | None:
     """The plan, if every robot may stand at its start and every target can be solved in time."""
     for robot in mission.robots:
         x, y = robot.cell
@@ -190,7 +321,7 @@ def _allowed(mission: Mission, site: Ground, passable: dict[str, BoolArray],
     if unsolvable(snapshot):
         return None
     try:
-        check_starts(site, placements(mission, Frame(mission.map.size, mission.map.cell_m)))
+        check_starts(site, placements(mission, Frame(mission.map.size, mission.map.cell_m), kinds))
     except InputError:
         return None
     plan = planner.plan(snapshot)
@@ -198,7 +329,7 @@ def _allowed(mission: Mission, site: Ground, passable: dict[str, BoolArray],
 
 
 def _draw_events(rates: Rates, mission: Mission, scenario: Scenario, plan: Plan,
-                 rng: np.random.Generator) -> tuple[Event, ...]:
+                 rng: np.random.Generator, kinds: Sequence[RobotKind]) -> tuple[Event, ...]:
     """Events in the middle half of the plan, in the order of their decisions."""
     snapshot = Snapshot.start(scenario)
     length = plan.makespan or 1
@@ -221,16 +352,16 @@ def _draw_events(rates: Rates, mission: Mission, scenario: Scenario, plan: Plan,
                for target in _new_targets(rates.new_targets, snapshot, mission, rng)]
     if rates.impassable:
         cells = simulate.replay(snapshot, plan.actions).cells
-        events += _closed_ways(rates.impassable, cells, mission, when, rng)
+        ground = [i for i, kind in enumerate(kinds) if not kind.flies]
+        events += _closed_ways(rates.impassable, cells, mission, ground, when, rng)
     return tuple(sorted(events, key=lambda event: event.at_decision))
 
 
-def _closed_ways(count: int, cells: IntArray, mission: Mission,
+def _closed_ways(count: int, cells: IntArray, mission: Mission, on_ground: Sequence[int],
                  when: Callable[[], int], rng: np.random.Generator) -> list[Event]:
     """News that a cell which the plan, at `cells` [T + 1, R, 2], has yet to cross with a
     robot on the ground is closed to its kind.
     """
-    on_ground = [i for i, robot in enumerate(mission.robots) if not KINDS.get(robot.kind).flies]
     found: list[Event] = []
     if not on_ground:
         return found
@@ -246,6 +377,7 @@ def _new_targets(count: int, snapshot: Snapshot, mission: Mission,
                  rng: np.random.Generator) -> list[Target]:
     """Targets on free cells that the whole team can solve."""
     team = sorted({skill for robot in mission.robots for skill in robot.skills})
+    bits = mission.scenario().skill_bits
     taken = {target.cell for target in mission.targets}
     found: list[Target] = []
     while len(found) < count:
@@ -255,7 +387,7 @@ def _new_targets(count: int, snapshot: Snapshot, mission: Mission,
                         f"N{len(found) + 1}")
         if not skills or at in taken:
             continue
-        need = sum(1 << "ABCDEFGH".index(skill) for skill in skills)
+        need = sum(bits[skill] for skill in skills)
         if not unsolvable(with_target(snapshot, target, need)):
             taken.add(at)
             found.append(target)

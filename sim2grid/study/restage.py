@@ -75,7 +75,9 @@ def restage(report: dict[str, Any], number: int, source: object,
         return Staged(chosen, prepared, timed, None, row, width)
     prepared = prepare(mission, source)
     make = maker(chosen)
-    fleet = fleet_of([mission], [1], prepared.site, prepared.passable)
+    mission = prepared.mission
+    fleet = fleet_of([mission], [1], prepared.site, prepared.passable,
+                     [robot.kind for robot in prepared.scene.robots])
     grid = on_grid(fleet, make, events=True, seeds={0: row.seed})[0]
     route = None
     if chosen.loop == "open":

@@ -28,6 +28,7 @@ from moonteam.report.intervals import NOTHING, Bootstrap, Figure, wilson
 from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import Report, RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
+from sim2grid.study.fleet import GIVEN
 
 
 def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence[Contender],
@@ -254,14 +255,20 @@ TIME_SPENT = ["site", "planner", "s of a mission", "a robot drives, by the groun
 """Of the mean robot. Slower: speeding up, coming to rest, making way. Standing: waiting for others,
 or done.
 """
+MISSIONS = ["mission", "contender", "came to", "s", "s at best, as planned", "decisions"]
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
             "seconds, ratio", "seconds more", "moves, ratio"]
 DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what differs"]
 """Titles of the comparisons and of the differences between engines."""
 
 
+def where(line: dict[str, Any]) -> str:
+    """The ground of a line: preset or model with its seed; nothing of missions that were given."""
+    return line["site"] if line["site"] == GIVEN else f"{line['site']} {line['site_seed']}"
+
+
 def tables(report: dict[str, Any]) -> list[Table]:
-    """The summary, the comparison of modes and the failures, for Markdown or a terminal."""
+    """Summary, missions that were given, comparisons, failures, for Markdown or a terminal."""
     events = any(report["options"].get("rates", {}).values())
     titles = ["site", "loop", "planner", "mode", "success"]
     titles += ["of solvable"] if events else []
@@ -270,7 +277,7 @@ def tables(report: dict[str, Any]) -> list[Table]:
     rows = []
     for line in report["summary"]:
         physical = line["loop"] != "grid"
-        cells = [f"{line['site']} {line['site_seed']}", line["loop"], line["planner"],
+        cells = [where(line), line["loop"], line["planner"],
                  _mode(line),
                  f"{line['solved']} of {line['missions']}, {spread(line, 'success', 3)}"]
         if events:
@@ -285,21 +292,27 @@ def tables(report: dict[str, Any]) -> list[Table]:
     found: list[Table] = [(titles, rows)]
     if clocked := [line for line in report["summary"] if line["mode"] == "clock"]:
         found.append((BY_THE_CLOCK, [[
-            f"{line['site']} {line['site_seed']}", line["planner"], spread(line, "optimum", 1),
+            where(line), line["planner"], spread(line, "optimum", 1),
             spread(line, "planned", 1), spread(line, "seconds", 1), spread(line, "over_plan", 3),
             spread(line, "slowdown", 3)] for line in clocked]))
         found.append((TIME_SPENT, [[
-            f"{line['site']} {line['site_seed']}", line["planner"], spread(line, "seconds", 1),
+            where(line), line["planner"], spread(line, "seconds", 1),
             _value(line["driving_s"] - line["slower_s"], 1), spread(line, "slower_s", 1),
             spread(line, "service_s", 1),
             _value(line["seconds"] - line["driving_s"] - line["service_s"], 1),
             _value(line["replans"], 2)] for line in clocked if line["driving_s"] is not None]))
+    if report["options"].get("mission"):
+        found.append((MISSIONS, [[
+            f"{row['number']} {row['report']['mission']}", row["contender"],
+            "solved" if row["report"]["success"] else str(row["report"]["cause"]).replace("_", " "),
+            _value(row["report"]["seconds"], 1), _value(row["nominal_s"], 1),
+            str(row["report"]["decisions"])] for row in report["rows"]]))
     if report["comparisons"]:
         found.append((COMPARED,
                       [[*map(str, row)] for row in compared_rows(report, spread)]))
     if report["differences"]:
         found.append((DIFFERENT, [[*map(str, row)] for row in different_rows(report)]))
-    causes = [[f"{line['site']} {line['site_seed']}", line["contender"], cause, str(len(numbers)),
+    causes = [[where(line), line["contender"], cause, str(len(numbers)),
                _numbers(numbers)]
               for line in report["failures"] for cause, numbers in line["causes"].items()]
     if causes:
@@ -310,7 +323,7 @@ def tables(report: dict[str, Any]) -> list[Table]:
 def compared_rows(report: dict[str, Any], write: Callable[[dict[str, Any], str, int], Any]
                   ) -> list[list[Any]]:
     """Cells under `COMPARED`; `write` makes one of a figure with its interval, as `spread` does."""
-    return [[f"{c['site']} {c['site_seed']}", c["contender"], c["over"],
+    return [[where(c), c["contender"], c["over"],
              f"{c['both_solved']} of {c['missions']}", c["only_this"], c["only_other"],
              write(c, "seconds", 3), write(c, "seconds_more", 2), write(c, "moves", 3)]
             for c in report["comparisons"]]
@@ -318,7 +331,7 @@ def compared_rows(report: dict[str, Any], write: Callable[[dict[str, Any], str, 
 
 def different_rows(report: dict[str, Any]) -> list[list[Any]]:
     """Cells under `DIFFERENT`."""
-    return [[f"{d['site']} {d['site_seed']}", d["number"], d["contender"], d["this"],
+    return [[where(d), d["number"], d["contender"], d["this"],
              d["over"], d["other"], d["why"]] for d in report["differences"]]
 
 
@@ -336,7 +349,8 @@ def csv_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
         report = row.report
         plan = report.grid_plan
         flat: dict[str, Any] = {
-            "number": row.number, "site": row.site, "site_seed": row.site_seed, "seed": row.seed,
+            "number": row.number, "mission": row.report.mission, "site": row.site,
+            "site_seed": row.site_seed, "seed": row.seed,
             "contender": row.contender, "success": int(report.success),
             "solvable": int(row.solvable), "cause": report.cause or "",
             "failure": "" if report.success else failure_label(row), "detail": report.detail,

@@ -30,11 +30,11 @@ def load(source: str | os.PathLike[str]
     name = os.fspath(source)
     path = Path(name)
     head, colon, which = name.rpartition(":")
-    if colon and not path.exists() and path.suffix not in YAML:
+    if colon and not path.is_file() and path.suffix not in YAML:
         return pick(paths.find(head, "testsets", ".jsonl"), which)
     if path.suffix == ".jsonl":
         return load_set(path)
-    if path.suffix in YAML or (not path.suffix and not path.exists()):
+    if path.suffix in YAML or (not path.suffix and not path.is_file()):
         if (paths.assets() / "testsets" / f"{name}.jsonl").is_file():
             return load_set(paths.find(name, "testsets", ".jsonl"))
         return load_mission(name)
@@ -76,11 +76,14 @@ def load_single(source: str | os.PathLike[str]) -> Mission | Scenario | Timed:
 def load_mission(name: str) -> Mission:
     """A mission file, or the bundled mission of that name, its kinds of robot found.
 
-    Raises InputError.
+    Files that it names have their full paths: it can be written anywhere. Raises InputError.
     """
     from moonteam.robots import team
 
     found, path = read_mission(name)
+    if found.site.dem is not None:
+        full = os.fspath(Path(found.site.dem).resolve())
+        found = msgspec.structs.replace(found, site=msgspec.structs.replace(found.site, dem=full))
     return team.settled(found, path)
 
 

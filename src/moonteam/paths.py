@@ -1,5 +1,6 @@
 """Where the bundled assets are: inside the wheel, else in the checkout."""
 
+import difflib
 from pathlib import Path
 
 from moonteam.errors import InputError
@@ -15,14 +16,20 @@ def assets() -> Path:
 
 
 def find(name: str, folder: str, suffix: str) -> Path:
-    """A user's file, else the bundled asset of that name (``demo`` for missions/demo.yaml)."""
+    """A user's file, else the bundled asset of that name (``demo`` for missions/demo.yaml).
+
+    A folder of that name is no file. Raises InputError.
+    """
     path = Path(name)
-    if path.exists():
+    if path.exists() and not path.is_dir():
         return path
     if path.suffix == suffix and path.parent != Path():
-        raise InputError(name, "no such file")
+        raise InputError(name, "is a folder" if path.is_dir() else "no such file")
     bundled = assets() / folder / (name if name.endswith(suffix) else name + suffix)
     if bundled.is_file():
         return bundled
     names = sorted(p.stem for p in (assets() / folder).glob(f"*{suffix}"))
-    raise InputError(name, f"no such file, nor one of the bundled {folder}: {', '.join(names)}")
+    near = difflib.get_close_matches(path.stem, names, 1)
+    meant = f"; did you mean {near[0]}?" if near else ""
+    what = "is a folder, and not" if path.is_dir() else "no such file, nor"
+    raise InputError(name, f"{what} one of the bundled {folder}: {', '.join(names)}{meant}")

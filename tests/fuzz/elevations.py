@@ -13,6 +13,7 @@ import numpy as np
 import rasterio
 from affine import Affine
 
+from moonteam.problem.piece import Piece
 from moonteam.terrain import dem
 from moonteam.terrain.site import import_dem
 from tests.fuzz.mutation import Pairs, harmed, put, tree_of, written
@@ -133,8 +134,8 @@ def _packed(letter: str, values: Any) -> tuple[int, bytes]:
 def read(path: Path) -> None:
     """As a mission's site and `moonteam site` do."""
     pixel = 1.0 if path.suffix == ".npy" else None
-    found = dem.window(path, extent_m=8.0, pixel_m=pixel)
+    found = dem.window(path, Piece(8.0), pixel=pixel)
     assert np.isfinite(found.heights).all()
-    site = import_dem(path, extent_m=8.0, pixel_m=pixel, spacing=0.5)
+    site = import_dem(path, Piece(8.0), pixel=pixel, spacing=0.5)
     assert site.heights.shape == (17, 17)
     assert np.isfinite(site.heights).all()

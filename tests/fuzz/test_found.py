@@ -271,10 +271,10 @@ def test_arrays(tmp_path, header):
     path = tmp_path / "m.npy"
     path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode()
                      + bytes(999))
-    assert "is not a NumPy array file" in refusal(lambda path: dem.window(path, pixel_m=1.0), path)
+    assert "is not a NumPy array file" in refusal(lambda path: dem.window(path, pixel=1.0), path)
 
 
 def test_an_archive_of_arrays(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.zeros((9, 9)))
     path = (tmp_path / "a.npz").rename(tmp_path / "a.npy")
-    assert "is not a NumPy array file" in refusal(lambda path: dem.window(path, pixel_m=1.0), path)
+    assert "is not a NumPy array file" in refusal(lambda path: dem.window(path, pixel=1.0), path)

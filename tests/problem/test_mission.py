@@ -4,6 +4,7 @@ import pytest
 
 from moonteam.errors import InputError
 from moonteam.problem import mission
+from moonteam.problem.piece import Piece
 
 GOOD = """
 name: two
@@ -66,6 +67,20 @@ BAD = {
     "no steps": ("max_steps: 50", "max_steps: 0", "max_steps: 0 is not allowed; 1 to 100000"),
     "cell size": ("cell_m: 1.5", "cell_m: .nan", "'.nan' is no finite number (line"),
     "two sites": ("preset: mare", "preset: mare, dem: a.tif", "site: give one of preset and dem"),
+    "piece of a preset": ("preset: mare", "preset: mare, detrend: true",
+                          "site.detrend: is for an elevation model; give dem in place of preset"),
+    "unknown units": ("preset: mare", "dem: a.tif, units: miles",
+                      "site.units: unknown value 'miles'; allowed: degrees"),
+    "no latitude": ("preset: mare", "dem: a.tif, units: degrees, centre: [120, 0]",
+                    "site.centre: 120, 0 is not allowed; a latitude of -90 to 90 and a longitude"),
+    "degrees from where": ("preset: mare", "dem: a.tif, units: degrees",
+                           "site.centre: is needed where units are degrees"),
+    "turned too far": ("preset: mare", "dem: a.tif, rotation: 700",
+                       "site.rotation: 700 is not allowed; -360 to 360 degrees"),
+    "no size": ("preset: mare", "dem: a.tif, size: [20, 0]",
+                "site.size: 0 is not allowed; above 0 metres"),
+    "three sizes": ("preset: mare", "dem: a.tif, size: [20, 0, 3]", "site.size: "),
+    "no band": ("preset: mare", "dem: a.tif, band: -1", "site.band: -1 is not allowed; at least 0"),
     "event of nobody": ("lost: flyer", "lost: yutu", "events[0].lost: no robot is named 'yutu'"),
     "event's skill nobody has": ("lost: flyer", "target: {at: [2, 2], skills: [drill]}",
                                  "events[0].target.skills: no robot has skill drill"),
@@ -112,3 +127,13 @@ def test_missing_file_and_folder(tmp_path):
         mission.load(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="is a folder"):
         mission.load(tmp_path)
+
+
+def test_an_elevation_model_is_looked_for_beside_the_mission(tmp_path):
+    found = mission.load(write(tmp_path, GOOD.replace(
+        "preset: mare", "dem: moon/a.tif, centre: [512, 300.5], units: pixels, detail: false")))
+    assert found.site.dem == str(tmp_path / "moon" / "a.tif")
+    assert found.site.piece == Piece(None, (512, 300.5), "pixels")
+    assert not found.site.detail
+    full = mission.load(write(tmp_path, GOOD.replace("preset: mare", "dem: /moon/a.tif")))
+    assert full.site.dem == "/moon/a.tif"

@@ -7,10 +7,13 @@ import tracemalloc
 import numpy as np
 import pytest
 import rasterio
+import rasterio.transform
 from affine import Affine
 from rasterio.enums import MaskFlags
+from rasterio.warp import transform
 
 from moonteam.errors import InputError
+from moonteam.problem.piece import Piece
 from moonteam.terrain import dem
 from moonteam.terrain.site import import_dem
 
@@ -73,7 +76,7 @@ def write(path, turn="north up", shape=(1.0, 1.0), unit="m", stored="float32", c
 
 def check(path, centre=(3.1, -4.2), **more):
     """Heights to 1 mm, slopes to 0.1°, everywhere in a window of 24 by 20 m."""
-    site = import_dem(path, extent_m=(24.0, 20.0), centre_m=centre, detail=False, **more)
+    site = import_dem(path, Piece((24.0, 20.0), centre), detail=False, **more)
     y, x = (site.spacing * (np.arange(n) - (n - 1) / 2) for n in site.heights.shape)
     want = surface(centre[0] + x[None, :], centre[1] + y[:, None])
     off = site.heights - want
@@ -110,8 +113,8 @@ def test_one_surface_in_every_kind_of_numbers(tmp_path, stored, mask):
 
 def test_a_straight_model_comes_pixel_by_pixel(tmp_path):
     """North up, south up and mirrored give the same bits, and the window is all that is read."""
-    found = [dem.window(write(tmp_path / f"{i}.tif", turn, size=(160, 150)), extent_m=20.0,
-                        centre_m=(4.25, 2.25))
+    found = [dem.window(write(tmp_path / f"{i}.tif", turn, size=(160, 150)), Piece(20.0,
+                        (4.25, 2.25)))
              for i, turn in enumerate(("north up", "south up", "mirrored", "upside down"))]
     for other in found[1:]:
         np.testing.assert_allclose(other.heights, found[0].heights, atol=1e-6)
@@ -124,10 +127,10 @@ def test_holes_and_special_values_inside_the_window(tmp_path):
         values = source.read(1)
         values[70, 80], values[71, 81] = -3.4028226550889044e38, np.nan
         source.write(values, 1)
-    window = dem.window(path, extent_m=20.0)
+    window = dem.window(path, Piece(20.0))
     assert np.isnan(window.about).sum() == 2
     assert np.isfinite(window.heights).all()
-    assert np.ptp(import_dem(path, extent_m=20.0, detail=False).heights) < 5.0
+    assert np.ptp(import_dem(path, Piece(20.0), detail=False).heights) < 5.0
 
 
 def test_an_isis_cube(tmp_path):
@@ -147,7 +150,7 @@ def test_what_is_given_replaces_what_the_file_says(tmp_path):
     path = write(tmp_path / "m.tif", stored="float64 km")
     heights = dem.window(path).heights
     np.testing.assert_allclose(dem.window(path, scale=500.0).heights, heights / 2, rtol=1e-9)
-    assert dem.window(path, pixel_m=1.0).pixel == 1.0
+    assert dem.window(path, pixel=1.0).pixel == 1.0
     plain = write(tmp_path / "plain.tif", crs=False)
     check(plain)
 
@@ -159,7 +162,7 @@ def test_a_large_model_is_not_read_as_a_whole(tmp_path):
                        crs=MOON, transform=Affine(0.25, 0, 0, 0, -0.25, 0)):
         pass
     tracemalloc.start()
-    site = import_dem(tmp_path / "m.tif", extent_m=40.0, centre_m=(3000.0, -3000.0))
+    site = import_dem(tmp_path / "m.tif", Piece(40.0, (3000.0, -3000.0)))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert np.ptp(site.heights) == 0.0
@@ -170,11 +173,11 @@ def test_a_large_model_is_not_read_as_a_whole(tmp_path):
     ({"crs": "+proj=longlat +R=1737400 +no_defs"},
      r"project it to metres, such as by: gdalwarp .*\+lat_0=.* \+R=1737400"),
     ({"units": ("fathom",)}, "elevations in 'fathom', which is not known"),
-    ({"turn": "turned", "extent_m": None}, "how large a window is needed"),
-    ({"turn": "turned", "extent_m": 70.0}, "the window reaches over its edge"),
-    ({"shape": (1.0, 1.4), "extent_m": 90.0}, "the window reaches over its edge"),
-    ({"extent_m": 1.0, "wide": 5.0}, "is too coarse"),
-    ({"shape": (1.0, 2.0), "extent_m": 1.0, "wide": 5.0}, "is too coarse"),
+    ({"turn": "turned", "size": None}, "how large a piece of it is needed"),
+    ({"turn": "turned", "size": 70.0}, "is too small: .* and lacks"),
+    ({"shape": (1.0, 1.4), "size": 90.0}, "is too small: .* and lacks"),
+    ({"size": 1.0, "wide": 5.0}, "is too coarse"),
+    ({"shape": (1.0, 2.0), "size": 1.0, "wide": 5.0}, "is too coarse"),
 ])
 def test_what_cannot_be_ground_is_one_line(tmp_path, change, words):
     path = write(tmp_path / "m.tif", turn=change.get("turn", "north up"),
@@ -185,7 +188,7 @@ def test_what_cannot_be_ground_is_one_line(tmp_path, change, words):
         if "units" in change:
             source.units = change["units"]
     with pytest.raises(InputError, match=words) as refused:
-        import_dem(path, extent_m=change.get("extent_m", 20.0), pixel_m=change.get("wide"))
+        import_dem(path, Piece(change.get("size", 20.0)), pixel=change.get("wide"))
     assert "\n" not in str(refused.value)
 
 
@@ -205,3 +208,118 @@ def test_points_in_place_of_a_grid_and_other_drivers_are_refused(tmp_path):
         "</SimpleSource></VRTRasterBand></VRTDataset>")
     with pytest.raises(InputError, match="is not a GeoTIFF, nor another"):
         import_dem(tmp_path / "far.vrt")
+
+
+def test_a_centre_is_said_in_metres_pixels_or_degrees(tmp_path):
+    """The same place of one model in each unit, whatever way its rows and columns run."""
+    for k, (turn, shape) in enumerate(CASES):
+        path = write(tmp_path / f"{k}.tif", turn, shape, [*METRES][k % 3])
+        east, north = 3.1, -4.2
+        with rasterio.open(path) as source:
+            move, factor = source.transform, METRES[[*METRES][k % 3]]
+            x, y = rasterio.transform.xy(move, source.height / 2, source.width / 2, offset="ul")
+            x, y = x + east / factor, y + north / factor
+            row, column = (float(v) - 0.5 for v in rasterio.transform.rowcol(
+                move, x, y, op=lambda value: value))
+            longitude, latitude = (float(found[0]) for found in transform(
+                source.crs, "+proj=longlat +R=1737400", [x], [y])[:2])
+        found = [dem.window(path, Piece((24.0, 20.0), (east, north))),
+                 dem.window(path, Piece(None, (column, row), "pixels"), need=(24.0, 20.0)),
+                 dem.window(path, Piece(None, (latitude, longitude), "degrees"),
+                            need=(24.0, 20.0))]
+        for one in found:
+            np.testing.assert_allclose(one.centre, (east, north), atol=1e-3)
+            assert one.sides == (24.0, 20.0)
+            np.testing.assert_allclose(one.heights, found[0].heights, atol=1e-3)
+
+
+def test_a_size_is_said_in_pixels_or_degrees(tmp_path):
+    path = write(tmp_path / "m.tif", shape=(1.5, 1.0))  # pixels of 0.75 by 0.5 m
+    assert dem.window(path, Piece((40, 60), units="pixels")).sides == (30.0, 30.0)
+    with rasterio.open(path) as source:
+        longitude, latitude = (float(found[0]) for found in transform(
+            source.crs, "+proj=longlat +R=1737400", [70_000.0 + 60], [-50_000.0 - 37])[:2])
+    degree = math.radians(1.0) * 1_737_400.0  # m of latitude
+    piece = Piece((20 / degree, 16 / degree / math.cos(math.radians(latitude))),
+                  (latitude, longitude), "degrees")
+    width, height = dem.window(path, piece).sides
+    # The projection is true to scale at its own centre, 86 km away.
+    assert width == pytest.approx(16.0, rel=2e-3)
+    assert height == pytest.approx(20.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("degrees", [30.0, -90.0, 200.0])
+def test_a_window_is_turned_clockwise(tmp_path, degrees):
+    path = write(tmp_path / "m.tif", "mirrored", size=(200, 200))
+    site = import_dem(path, Piece((24.0, 20.0), (3.1, -4.2), rotation=degrees), detail=False)
+    y, x = (site.spacing * (np.arange(n) - (n - 1) / 2) for n in site.heights.shape)
+    x, y = np.meshgrid(x, y)
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    want = surface(3.1 + x * cos + y * sin, -4.2 - x * sin + y * cos)
+    off = site.heights - want
+    assert np.abs(off - off.mean()).max() < 1e-3
+    again = dem.window(path, Piece((24.0, 20.0), (3.1, -4.2), rotation=degrees - 360.0 * (
+        degrees > 0))).heights
+    np.testing.assert_array_equal(
+        again, dem.window(path, Piece((24.0, 20.0), (3.1, -4.2), rotation=degrees)).heights)
+
+
+@pytest.mark.parametrize("turn", ["north up", "upside down", "on its side"])
+def test_a_map_needs_its_own_ground_and_no_more(tmp_path, turn):
+    """32 m of ground for 32 m; the margin about it goes on as the ground does at the edge."""
+    path = write(tmp_path / "m.tif", turn, size=(64, 64))
+    found = dem.window(path, need=(32.0, 32.0), margin=4.0)
+    assert found.sides == (40.0, 40.0)
+    assert found.made_up == 4.0
+    y, x = (0.5 * (np.arange(n) - (n - 1) / 2) for n in found.core.shape)
+    off = found.core - surface(x[None, :], y[:, None])
+    inside = off[9:-9, 9:-9]
+    assert np.abs(inside - inside.mean()).max() < 0.01
+    # A steep tilt goes on over the edge; without it the margin would be a kink or a terrace.
+    up, across = np.gradient(found.core, 0.5)
+    slope = np.hypot(up, across)
+    assert slope[:8].max() < 1.6 * slope[9:-9, 9:-9].max()
+    larger = dem.window(write(tmp_path / "l.tif", turn, size=(80, 80)), need=(32.0, 32.0),
+                        margin=4.0)
+    assert larger.made_up == 0.0
+    with pytest.raises(InputError, match=r"34 by 32 m of ground are needed around 0 m east, 0 m "
+                       r"north of its centre; it is 32 by 32 m and lacks 1 m .*, 1 m [^,]*$"):
+        dem.window(path, need=(34.0, 32.0), margin=4.0)
+
+
+def test_what_is_lacking_is_said_by_its_side(tmp_path):
+    path = write(tmp_path / "m.tif", "upside down", size=(64, 64))
+    with pytest.raises(InputError, match=r"and lacks 8 m in the east, 2 m in the south$"):
+        dem.window(path, Piece(20.0, (14.0, -8.0)))
+    with pytest.raises(InputError, match=r"turned by 45 degrees; .* lacks 3.8 m in the east, "):
+        dem.window(path, Piece(28.0, rotation=45.0))
+
+
+@pytest.mark.parametrize(("piece", "crs", "words"), [
+    (Piece(20.0, (91.0, 0.0), "degrees"), True, "centre: 91, 0 is not allowed; a latitude of -90"),
+    (Piece(20.0, None, "degrees"), True, "centre: is needed where units are degrees"),
+    (Piece(0.001, (-85.0, 10.0), "degrees"), False, "units: has no projection"),
+    (Piece(0.001, (85.0, 190.0), "degrees"), True, "centre: latitude 85, longitude 190 is not on"),
+    (Piece(0.001, (-85.0, 10.0), "degrees"), True, "too small: .* and lacks "),
+    (Piece(20.0, (-85.0, 10.0), "degrees"), True, "size: 20 degrees of latitude and 20 .* a pole"),
+    (Piece(20.0, rotation=400.0), True, "rotation: 400 is not allowed; -360 to 360 degrees"),
+    (Piece((20.0, 0.0)), True, "size: 0 is not allowed; above 0 metres"),
+    (Piece(None, (1.0, 1.0)), True, "size: how large a piece of it is needed must be said"),
+    (Piece(20.0, (math.nan, 1.0), "pixels"), True, "centre: nan, 1 is not allowed; two finite"),
+])
+def test_a_piece_that_cannot_be_is_one_line(tmp_path, piece, crs, words):
+    path = write(tmp_path / "m.tif", crs=crs)
+    with pytest.raises(InputError, match=f"^{path}: .*{words}") as refused:
+        dem.window(path, piece)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_array_has_pixels_but_no_latitude(tmp_path):
+    heights = np.arange(400.0).reshape(20, 20)
+    np.save(tmp_path / "h.npy", heights)
+    found = dem.window(tmp_path / "h.npy", Piece(4, (10, 5), "pixels"), pixel=10.0)
+    assert found.centre == (5.0, 45.0)
+    assert found.sides == (40.0, 40.0)
+    assert found.heights[found.heights.shape[0] // 2, found.heights.shape[1] // 2] == heights[5, 10]
+    with pytest.raises(InputError, match=r"h\.npy: units: says nothing of latitude"):
+        dem.window(tmp_path / "h.npy", Piece(4, (10, 5), "degrees"), pixel=10.0)

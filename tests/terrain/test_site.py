@@ -5,11 +5,16 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
+from moonteam.problem import mission as missions
 from moonteam.problem.mission import Map, Mission, Robot, Target
 from moonteam.problem.mission import Site as MissionSite
+from moonteam.problem.piece import Piece
+from moonteam.robots import KINDS, OWN
+from moonteam.robots.team import limits
 from moonteam.terrain import generate
 from moonteam.terrain.measure import crater_counts, measure, poisson_interval, slope_map
 from moonteam.terrain.site import for_mission, import_dem, make_site
+from moonteam.terrain.traversability import passable_cells
 
 PRESETS = list(generate.PRESETS)
 
@@ -99,7 +104,7 @@ def test_a_written_model_comes_back_as_it_was(tmp_path):
     generate.write_dem(tmp_path / "a.tif", site.heights, site.spacing)
     np.save(tmp_path / "a.npy", site.heights[::-1])
     level = site.heights - site.heights.mean()
-    for back in (import_dem(tmp_path / "a.tif"), import_dem(tmp_path / "a.npy", pixel_m=0.25)):
+    for back in (import_dem(tmp_path / "a.tif"), import_dem(tmp_path / "a.npy", pixel=0.25)):
         assert back.heights.shape == site.heights.shape
         assert np.abs(back.heights - level).max() < 1e-5
 
@@ -116,15 +121,15 @@ def coarse(tmp_path, pixel=2.0):
 
 def test_detrending_takes_the_slope_out_and_keeps_the_relief(tmp_path):
     path = coarse(tmp_path)
-    raw = import_dem(path, pixel_m=2.0, extent_m=40.0)
-    level = import_dem(path, pixel_m=2.0, extent_m=40.0, detrend=True)
+    raw = import_dem(path, Piece(40.0), pixel=2.0)
+    level = import_dem(path, Piece(40.0), pixel=2.0, detrend=True)
     assert np.ptp(raw.heights) > 3.5
     assert 0.2 < np.ptp(level.heights) < 1.5
 
 
 def test_detail_is_finer_than_the_model_and_seeded(tmp_path):
     path = coarse(tmp_path)
-    made = [import_dem(path, pixel_m=2.0, extent_m=30.0, detail=d, seed=s).heights
+    made = [import_dem(path, Piece(30.0), pixel=2.0, detail=d, seed=s).heights
             for d, s in ((False, 1), (True, 1), (True, 1), (True, 2))]
     curvature = [np.abs(np.diff(h, 2, axis=0)).mean() for h in made]
     assert curvature[1] > 1.5 * curvature[0]
@@ -136,7 +141,7 @@ def test_the_window_is_where_it_is_asked_for(tmp_path):
     y, x = np.mgrid[0:41, 0:41].astype(float)
     np.save(tmp_path / "d.npy", (0.2 * np.exp(-((x - 30) ** 2 + (y - 10) ** 2) / 4)))
     # Column 30 is 10 m east of the middle; row 10 of a picture is 10 m north of it.
-    site = import_dem(tmp_path / "d.npy", pixel_m=1.0, extent_m=8.0, centre_m=(10.0, 10.0))
+    site = import_dem(tmp_path / "d.npy", Piece(8.0, (10.0, 10.0)), pixel=1.0)
     assert np.unravel_index(site.heights.argmax(), site.heights.shape) == (16, 16)
 
 
@@ -144,7 +149,7 @@ def test_small_holes_are_filled(tmp_path):
     heights = np.full((40, 40), 5.0)
     heights[10:13, 20:22] = np.nan
     np.save(tmp_path / "h.npy", heights)
-    assert np.ptp(import_dem(tmp_path / "h.npy", pixel_m=1.0).heights) < 1e-3
+    assert np.ptp(import_dem(tmp_path / "h.npy", pixel=1.0).heights) < 1e-3
 
 
 def bad_models(folder):
@@ -164,38 +169,36 @@ def bad_models(folder):
         ("words.tif", {}, "not a GeoTIFF"),
         ("words.npy", {}, "not a NumPy"),
         ("ok.tif", {"band": 3}, "no band 3"),
-        ("ok.tif", {"extent_m": 100.0}, "too small"),
-        ("ok.tif", {"extent_m": 10.0, "centre_m": (18.0, 0.0)}, "too small"),
-        ("holes.npy", {"pixel_m": 1.0}, "no data"),
-        ("cube.npy", {"pixel_m": 1.0}, "rows, columns"),
-        ("text.npy", {"pixel_m": 1.0}, "rows, columns"),
-        ("cliff.npy", {"pixel_m": 1.0}, "not in metres"),
-        ("flat.npy", {"pixel_m": 1e6}, "0.01 to 1000"),
+        ("ok.tif", {"size": 100.0}, "too small"),
+        ("ok.tif", {"size": 10.0, "centre": (18.0, 0.0)}, "too small"),
+        ("holes.npy", {"pixel": 1.0}, "no data"),
+        ("cube.npy", {"pixel": 1.0}, "rows, columns"),
+        ("text.npy", {"pixel": 1.0}, "rows, columns"),
+        ("cliff.npy", {"pixel": 1.0}, "not in metres"),
+        ("flat.npy", {"pixel": 1e6}, "0.01 to 1000"),
         ("flat.npy", {}, "metres a pixel"),
-        ("tiny.npy", {"pixel_m": 1.0}, "too small"),
-        ("flat.npy", {"pixel_m": 10.0, "extent_m": 5.0}, "too coarse"),
-        ("flat.npy", {"pixel_m": math.nan}, "0.01 to 1000"),
-        ("flat.npy", {"pixel_m": 1.0, "extent_m": math.nan}, "not allowed"),
-        ("flat.npy", {"pixel_m": 1.0, "extent_m": 10.0, "centre_m": (math.nan, 0.0)},
+        ("tiny.npy", {"pixel": 1.0}, "too small"),
+        ("flat.npy", {"pixel": 10.0, "size": 5.0}, "too coarse"),
+        ("flat.npy", {"pixel": math.nan}, "0.01 to 1000"),
+        ("flat.npy", {"pixel": 1.0, "size": math.nan}, "not allowed"),
+        ("flat.npy", {"pixel": 1.0, "size": 10.0, "centre": (math.nan, 0.0)},
          "finite"),
-        ("flat.npy", {"pixel_m": 1.0, "scale": math.inf}, "finite"),
+        ("flat.npy", {"pixel": 1.0, "scale": math.inf}, "finite"),
         ("nothing.tif", {}, "no data"),
     ]
-
-
-OPTIONS = {"pixel_m": "--pixel", "extent_m": "--size", "centre_m": "--centre",
-           "band": "--band", "scale": "--scale"}
 
 
 @pytest.mark.parametrize("index", range(19))
 def test_bad_elevation_models_get_one_line_and_exit_code_2(tmp_path, capsys, index):
     name, arguments, words = bad_models(tmp_path)[index]
+    given = dict(arguments)
+    piece = Piece(given.pop("size", None), given.pop("centre", None))
     with pytest.raises(InputError, match=words) as caught:
-        import_dem(tmp_path / name, **arguments)
+        import_dem(tmp_path / name, piece, **given)
     assert "\n" not in str(caught.value)
     assert name in str(caught.value)
     asked = [word for key, value in arguments.items() for word in (
-        OPTIONS[key], *map(str, value if isinstance(value, tuple) else (value,)))]
+        f"--{key}", *map(str, value if isinstance(value, tuple) else (value,)))]
     assert main(["site", "--dem", str(tmp_path / name), *asked]) == 2
     told = capsys.readouterr()
     assert told.out == ""
@@ -211,3 +214,78 @@ def test_measure_reports_what_the_ground_is():
     assert report["samples"] == [97, 97]
     assert 0.5 < report["roughness"]["hurst"] <= 1.0
     assert report["slope_deg"]["p50"] < report["slope_deg"]["p95"] < report["slope_deg"]["p100"]
+
+
+def mission_on(folder, heights, site, size="[8, 8]"):
+    """A mission's file with its model of 1 m pixels beside it."""
+    np.save(folder / "moon.npy", heights)
+    path = folder / "mission.yaml"
+    path.write_text(f"""
+map: {{size: {size}}}
+site: {{dem: moon.npy, pixel: 1.0, {site}}}
+robots: [{{name: r, kind: wheeled, skills: [A], start: [0, 0]}}]
+targets: [{{at: [3, 3], skills: [A]}}]
+""")
+    return path
+
+
+def test_a_mission_says_which_piece_of_a_model_it_stands_on(tmp_path, monkeypatch):
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0)[::-1])
+    heights = 0.1 * x + 0.01 * (y - 5) ** 2
+    monkeypatch.chdir(tmp_path.parent)  # the file is beside the mission, not here
+    site = for_mission(missions.load(mission_on(
+        tmp_path, heights, "units: pixels, centre: [12, 9], rotation: 90, detail: false")))
+    assert site.meta["centre_m"] == [2.5, 0.5]
+    assert site.meta["made_up_m"] == 0.5
+    assert site.extent == (8.0, 8.0)
+    middle = site.heights.shape[0] // 2
+    # Its north is the model's east, which rises by a tenth, and its east the model's south.
+    north = site.heights[middle + 12, middle] - site.heights[middle - 12, middle]
+    east = site.heights[middle, middle + 12] - site.heights[middle, middle - 12]
+    assert north == pytest.approx(0.1 * 6, abs=0.01)
+    assert east == pytest.approx(0.01 * (2 ** 2 - 8 ** 2), abs=0.01)
+
+
+def test_a_mission_chooses_whether_detail_is_added_and_slopes_are_taken_out(tmp_path):
+    y, x = np.mgrid[:40, :40] * 1.0
+    heights = 0.2 * x + 0.3 * np.sin(x / 2) * np.cos(y / 3)
+    made = {site: for_mission(missions.load(mission_on(tmp_path, heights, site))).heights
+            for site in ("seed: 1", "seed: 1, detail: false", "seed: 2, detail: false",
+                         "detail: false, detrend: true")}
+    plain, rough = made["seed: 1, detail: false"], made["seed: 1"]
+    np.testing.assert_array_equal(plain, made["seed: 2, detail: false"])
+    assert 1e-4 < np.abs(plain - rough).max() < 0.5
+    assert np.ptp(made["detail: false, detrend: true"]) < np.ptp(plain) - 2.0
+
+
+@pytest.mark.parametrize(("site", "size", "words"), [
+    ("detail: false", "[12, 9]", "site.dem: {dem}: is too small: 12 by 9 m of ground are needed "
+     "around 0 m east, 0 m north of its centre; it is 8 by 8 m and lacks 2 m in the west, 2 m in "
+     "the east, 0.5 m in the north, 0.5 m in the south"),
+    ("size: 6", "[8, 8]", "site.size: {dem}: 6 by 6 m is not allowed; the map alone is 8 by 8 m"),
+    ("centre: [1, 0]", "[8, 8]", "site.dem: {dem}: is too small: 8 by 8 m of ground are needed "
+     "around 1 m east, 0 m north of its centre; it is 8 by 8 m and lacks 1 m in the east"),
+    ("units: degrees, centre: [1, 0]", "[8, 8]", "site.units: {dem}: says nothing of latitude"),
+    ("band: 0", "[1024, 1024]", "site.dem: {dem}: is too small"),
+])
+def test_ground_that_a_model_cannot_give_is_said_of_the_mission(tmp_path, capsys, site, size,
+                                                               words):
+    path = mission_on(tmp_path, np.zeros((8, 8)), site, size)
+    out = tmp_path / "out"
+    for command in (["rollout", str(path), "--planner", "greedy", "--out", str(out)],
+                    ["evaluate", "execution", "--mission", str(path), "--planner", "greedy",
+                     "--out", str(out)]):
+        assert main(command) == 2
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1
+        assert words.format(dem=tmp_path / "moon.npy") in told
+        assert str(path.name) in told
+        assert not out.exists() or [*out.iterdir()] == []
+
+
+def test_a_map_as_large_as_its_model_is_open_to_its_edge(tmp_path):
+    """8 m of ground for 8 m: no robot is kept off the outermost cells."""
+    found = missions.load(mission_on(tmp_path, np.zeros((8, 8)), "detail: false"))
+    kinds = {name: KINDS.get(name) for name in OWN}
+    for name, cells in passable_cells(for_mission(found), found, limits(kinds)).items():
+        assert cells.all(), name

@@ -73,7 +73,7 @@ def ground_of(mission: Mission) -> Ground:
     if named.clock == "steps" and named.events:
         named = msgspec.structs.replace(named, events=())
     named = msgspec.structs.replace(named, clock="seconds")
-    site = for_mission(named)
+    site = for_mission(named, source=mission.name)
     roads = Roads.of_mission(site, named, team.limits(kinds))
     its = [kinds[robot.kind] for robot in named.robots]
     asked = OnGround(named, [kind.speed for kind in its], [kind.settle for kind in its])

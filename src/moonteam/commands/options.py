@@ -13,7 +13,7 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -162,6 +162,38 @@ class Missions(Seeded):
     """Cells of a side of the map."""
     max_steps: int = 128
     """Joint decisions after which a mission has failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Elevation:
+    """Ground from an elevation model."""
+
+    dem: Path | None = None
+    """Elevation model: GeoTIFF, ISIS cube or another raster in metres, or .npy [rows, columns] m
+    with north first."""
+    centre: tuple[float, float] | None = None
+    """Of the window in --dem, in --units; the model's centre if not given."""
+    units: Literal["metres", "pixels", "degrees"] = "metres"
+    """What --centre is in: metres east and north of the model's centre, column and row of pixels
+    counted from 0 in the upper left, or latitude and longitude."""
+    rotation: float = 0.0
+    """Degrees from the model's north, clockwise, to that of the window."""
+    pixel: float | None = None
+    """Metres a pixel of --dem; needed where the file does not say."""
+    band: int = 0
+    """Of --dem, counted from 0."""
+    scale: float | None = None
+    """Metres a unit of elevation of --dem, if the file is wrong or does not say."""
+    detrend: bool = False
+    """Take the plane of best fit out of --dem."""
+    detail: bool = True
+    """Add relief finer than the pixels of --dem, continuing its power spectrum."""
+
+    def model_options(self) -> dict[str, Any]:
+        """The options of a model that are not their defaults, by field."""
+        usual = Elevation()
+        return {field.name: value for field in fields(Elevation)
+                if (value := getattr(self, field.name)) != getattr(usual, field.name)}
 
 
 @dataclass(frozen=True, kw_only=True)

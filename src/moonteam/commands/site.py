@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
-from moonteam.commands.options import Printed, Saved
+from moonteam.commands.options import Elevation, Printed, Saved
 from moonteam.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ FILES = ("site.json", "heights.npy", "heights.tif", "maps.npz", "hillshade.png",
 
 
 @dataclass(frozen=True)
-class Args(Saved, Printed):
+class Args(Elevation, Saved, Printed):
     """Make a site from a preset, or import an elevation model, and preview it.
 
     Writes heights.npy and heights.tif, site.json (measured slopes, roughness, crater counts
@@ -34,6 +34,7 @@ class Args(Saved, Printed):
     Examples:
       moonteam site --preset mare --seed 3 --size 32 --out runs/site
       moonteam site --dem moon.tif --size 40 --centre 120 -35 --detrend --out runs/dem
+      moonteam site --dem moon.tif --size 40 --units pixels --centre 512 300 --rotation 30
       moonteam site --dem heights.npy --pixel 1.0 --json
       moonteam site --preset highland --travel KIND --to 5 -3 --out runs/travel
     """
@@ -44,36 +45,15 @@ class Args(Saved, Printed):
     seed: int = 0
     """the same seed gives the same ground to the bit"""
 
-    size: float | None = None
-    """side, m; 32 for a preset, all of it for --dem"""
+    size: tuple[float, ...] = ()
+    """side, or two sides, m; 32 for a preset, all of it for --dem, of which it is in --units:
+    metres, pixels, or as long as degrees of latitude and longitude are there"""
 
     spacing: float = 0.25
     """between elevation samples, m"""
 
     cell: float = 1.0
     """side of a mission cell, m, for the traversability maps"""
-
-    dem: Path | None = None
-    """elevation model to import: GeoTIFF, ISIS cube or another raster in metres, or .npy [rows,
-    columns] m with north first"""
-
-    centre: tuple[float, float] = (0.0, 0.0)
-    """of the window, m east and north of the elevation model's centre"""
-
-    pixel: float | None = None
-    """metres a pixel of --dem; needed where the file does not say"""
-
-    band: int = 0
-    """of a GeoTIFF, counted from 0"""
-
-    scale: float | None = None
-    """metres a unit of elevation of --dem, if the file is wrong or does not say"""
-
-    detrend: bool = False
-    """take the plane of best fit out of --dem"""
-
-    detail: bool = True
-    """add relief finer than --dem, continuing its power spectrum"""
 
     travel: str | None = None
     """a kind of robot: how many seconds it needs to --to, and ways (travel.png in --out)"""
@@ -122,12 +102,18 @@ def _travel(site: Site, args: Args, kind: str) -> Any:
 
 
 def _site(args: Args) -> Site:
+    from moonteam.problem.piece import Piece
     from moonteam.terrain.site import import_dem, make_site
 
+    if len(args.size) > 2:
+        raise InputError("--size", f"{len(args.size)} numbers; one or two are allowed")
+    size = args.size[0] if len(args.size) == 1 else (args.size[:2] or None)
     if args.dem is None:
-        return make_site(args.preset, args.seed, args.size or 32.0, args.spacing)
-    return import_dem(args.dem, extent_m=args.size, centre_m=args.centre, pixel_m=args.pixel,
-                      band=args.band, scale=args.scale, detrend=args.detrend,
+        for name in args.model_options():
+            raise InputError(f"--{name}", "is for an elevation model; give --dem too")
+        return make_site(args.preset, args.seed, 32.0 if size is None else size, args.spacing)
+    return import_dem(args.dem, Piece(size, args.centre, args.units, args.rotation),
+                      pixel=args.pixel, band=args.band, scale=args.scale, detrend=args.detrend,
                       detail=args.detail, spacing=args.spacing, seed=args.seed)
 
 

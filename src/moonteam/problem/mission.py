@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
@@ -14,6 +15,7 @@ import msgspec
 from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem import scenario, timed
+from moonteam.problem.piece import Piece, Units
 from moonteam.problem.scenario import MOST_AGENTS, MOST_STEPS, MOST_TARGETS, Cell, Name, Skills
 from moonteam.strict import yaml_value
 
@@ -37,11 +39,34 @@ class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The ground: a `preset` made from `seed`, or a `dem` file (GeoTIFF or .npy)."""
+    """The ground: a `preset` made from `seed`, or a `dem` file (GeoTIFF or .npy).
+
+    The other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel` and a unit of
+    elevation (`scale`) where the file does not say; `detrend` takes the plane of best fit out;
+    `detail` adds relief finer than its pixels, from `seed`.
+    """
 
     preset: str | None = None
     dem: str | None = None
     seed: int = 0
+    centre: tuple[float, float] | None = None
+    size: float | tuple[float, float] | None = None
+    units: Units = "metres"
+    rotation: float = 0.0
+    pixel: float | None = None
+    band: int = 0
+    scale: float | None = None
+    detrend: bool = False
+    detail: bool = True
+
+    @property
+    def piece(self) -> Piece:
+        """Which part of the model."""
+        return Piece(self.size, self.centre, self.units, self.rotation)
+
+
+MODEL_ONLY = ("centre", "size", "units", "rotation", "pixel", "band", "scale", "detrend", "detail")
+"""Keys of a site that mean nothing without a dem."""
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -178,13 +203,20 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
 
 def load(path: str | os.PathLike[str]) -> Mission:
-    """Reads and checks a mission file. Raises InputError naming file, key and what is allowed."""
+    """Reads and checks a mission file; its `dem` is looked for beside it.
+
+    Raises InputError naming file, key and what is allowed.
+    """
     value = yaml_value(files.read_text(path), path)
     if value is None:
         raise InputError(path, "is empty; keys map, robots and targets are needed")
     if not isinstance(value, dict):
         raise InputError(path, "is not a mapping; keys map, robots and targets are needed")
-    return check(files.convert(value, Mission, path), path)
+    found = check(files.convert(value, Mission, path), path)
+    if found.site.dem is None:
+        return found
+    beside = os.fspath(Path(path).parent / found.site.dem)
+    return msgspec.structs.replace(found, site=msgspec.structs.replace(found.site, dem=beside))
 
 
 def check(mission: Mission, source: object) -> Mission:
@@ -287,6 +319,14 @@ def _as_mission_keys(mission: Mission, source: object) -> None:
 def _check_site(site: Site, source: object) -> None:
     if (site.preset is None) == (site.dem is None):
         raise InputError(source, "give one of preset and dem", "site")
+    if site.dem is None:
+        for key in MODEL_ONLY:
+            if getattr(site, key) != getattr(Site(), key):
+                raise InputError(source, "is for an elevation model; give dem in place of preset",
+                                 f"site.{key}")
+    site.piece.check(lambda key, problem: InputError(source, problem, f"site.{key}"))
+    if site.band < 0:
+        raise InputError(source, f"{site.band} is not allowed; at least 0", "site.band")
     if not 0 <= site.seed <= MOST_SEED:
         raise InputError(source, f"{site.seed} is not allowed; 0 to {MOST_SEED}", "site.seed")
 

@@ -40,7 +40,7 @@ def resolve(mission: Mission, source: object) -> tuple[Mission, Kinds]:
             raise InputError(source, f"{written}: another kind is called {kind.name!r} here", key)
         return kind.name
 
-    found = _with_kinds(mission, name_of)
+    found = with_kinds(mission, name_of)
     for i, robot in enumerate(found.robots):
         most = kinds[robot.kind].speed
         if robot.speed is not None and robot.speed > most:
@@ -59,10 +59,10 @@ def settled(mission: Mission, source: object) -> Mission:
         found = beside(written, source)
         return found if found == written else str(Path(found).resolve())
 
-    return _with_kinds(mission, full)
+    return with_kinds(mission, full)
 
 
-def _with_kinds(mission: Mission, name: Callable[[str, str], str]) -> Mission:
+def with_kinds(mission: Mission, name: Callable[[str, str], str]) -> Mission:
     """The mission with every kind that it names called `name(as written, key)`."""
     robots = tuple(
         msgspec.structs.replace(robot, kind=name(robot.kind, f"robots[{i}].kind"))

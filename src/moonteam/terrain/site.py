@@ -21,6 +21,7 @@ import trimesh
 
 from moonteam.errors import InputError
 from moonteam.problem.mission import Mission
+from moonteam.problem.piece import WHOLE, Piece
 from moonteam.terrain import dem, generate
 from moonteam.terrain.surface import Surface
 
@@ -132,21 +133,43 @@ def rough_ground(shape: tuple[int, int], rms: float, seed: int, spacing: float) 
     return heights / heights.std() * rms
 
 
-def for_mission(mission: Mission, spacing: float = SPACING) -> Site:
-    """The ground that a mission asks for: its map plus a margin, map centre = site centre."""
-    width, height = (n * mission.map.cell_m + 2 * MARGIN for n in mission.map.size)
-    if mission.site.dem is not None:
-        return import_dem(mission.site.dem, extent_m=(width, height), spacing=spacing,
-                          seed=mission.site.seed)
-    return make_site(mission.site.preset or "mare", mission.site.seed, (width, height), spacing)
+def for_mission(mission: Mission, spacing: float = SPACING, source: object = None) -> Site:
+    """The ground that a mission asks for: its map plus a margin, map centre = site centre.
+
+    An elevation model has to cover the map alone. Raises InputError naming `source`, where one is
+    given, and the key.
+    """
+    width, height = (n * mission.map.cell_m for n in mission.map.size)
+    its = mission.site
+    try:
+        if its.dem is None:
+            return make_site(its.preset or "mare", its.seed,
+                             (width + 2 * MARGIN, height + 2 * MARGIN), spacing)
+        return import_dem(
+            its.dem, its.piece, need=(width, height), margin=MARGIN, pixel=its.pixel,
+            band=its.band, scale=its.scale, detrend=its.detrend, detail=its.detail,
+            spacing=spacing, seed=its.seed)
+    except InputError as error:
+        if source is None:
+            raise
+        raise InputError(source, f"{error.source}: {error.problem}" if its.dem else error.problem,
+                         _mission_key(mission, error.key)) from None
+
+
+def _mission_key(mission: Mission, key: str) -> str:
+    """Where a mission's file says what is wrong with its ground."""
+    if key == "size" and mission.site.size is None:
+        return "map.size"
+    return f"site.{key or ('dem' if mission.site.dem else 'preset')}"
 
 
 def import_dem(
     path: str | os.PathLike[str],
+    piece: Piece = WHOLE,
     *,
-    extent_m: float | tuple[float, float] | None = None,
-    centre_m: tuple[float, float] = (0.0, 0.0),
-    pixel_m: float | None = None,
+    need: tuple[float, float] | None = None,
+    margin: float = 0.0,
+    pixel: float | None = None,
     band: int = 0,
     scale: float | None = None,
     detrend: bool = False,
@@ -159,9 +182,11 @@ def import_dem(
     Args:
       path: the file, see `dem.window`. An .npy array is [rows, columns] m, row 0 in the north
         like a picture.
-      extent_m: side, or (x, y) sides, of the window; None takes all of it.
-      centre_m: the window's centre from the model's centre, m east and north.
-      pixel_m: metres a pixel; needed for .npy and for a GeoTIFF that does not say.
+      piece: which part of it; all of it by default.
+      need: (x, y) sides m that must be there, which the part has if it says no size.
+      margin: m of ground kept around what is needed, past the model's edge going on as the ground
+        does there.
+      pixel: metres a pixel; needed for .npy and for a GeoTIFF that does not say.
       band: of a GeoTIFF, counted from 0.
       scale: metres a unit of elevation; None: as the file says, else 1.
       detrend: takes out the plane of best fit, else only the mean.
@@ -172,23 +197,21 @@ def import_dem(
 
     Raises InputError: not readable, no data, a scale that cannot be ground, a window outside.
     """
-    numbers = (("scale", 1.0 if scale is None else scale), ("centre", centre_m[0]),
-               ("centre", centre_m[1]))
-    for name, value in numbers:
-        if not math.isfinite(value):
-            raise InputError(path, f"{value} is not allowed; a finite number is needed", name)
-    found = dem.window(path, band=band, scale=scale, pixel_m=pixel_m, extent_m=extent_m,
-                       centre_m=centre_m)
-    pixel, core = found.pixel, found.core
-    dem.check_relief(path, core, pixel)
+    found = dem.window(path, piece, need=need, margin=margin, pixel=pixel, band=band, scale=scale)
+    core = found.core
+    dem.check_relief(path, core, found.pixel)
     window = found.heights - (dem.plane(found.heights) if detrend else core.mean())
-    sides = tuple((n - 1) * pixel for n in core.shape[::-1]) if extent_m is None else extent_m
+    sides = found.sides
+    if piece.size is None and need is None:  # to the last pixel
+        sides = ((core.shape[1] - 1) * found.pixel, (core.shape[0] - 1) * found.pixel)
     shape = _shape(path, sides, spacing)
     # The spectrum is of more of the model: a window has too few pixels to take one from.
-    fine = generate.spectrum(found.about, pixel) if detail and pixel > 2 * spacing else None
-    ground = generate.refine(window, pixel, found.shift, shape, spacing, seed, fine)
-    meta = {"dem": os.fspath(path), "pixel_m": pixel, "centre_m": list(centre_m), "band": band,
-            "scale": found.scale, "detrend": detrend, "detail": fine is not None}
+    fine = generate.spectrum(found.about, found.pixel) if (
+        detail and found.pixel > 2 * spacing) else None
+    ground = generate.refine(window, found.pixel, found.shift, shape, spacing, seed, fine)
+    meta = {"dem": os.fspath(path), "pixel_m": found.pixel, "centre_m": list(found.centre),
+            "rotation_deg": piece.rotation, "band": band, "scale": found.scale,
+            "detrend": detrend, "detail": fine is not None, "made_up_m": found.made_up}
     return Site(Path(path).stem, seed, ground, spacing, meta=meta)
 
 
