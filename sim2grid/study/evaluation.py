@@ -467,17 +467,16 @@ def deciders(name: str, options: PlannerOptions, modes: Sequence[Mode]
     that point at targets decide by the clock. Raises InputError for who decides in none of them.
     """
     clock, steps = "clock" in modes, any(mode != "clock" for mode in modes)
-    said, found = [], []
+    said: list[InputError] = []
+    found: list[Contender | None] = []
     for wanted, timed in ((steps, False), (clock, True)):
-        who = None
+        found.append(None)
         if wanted:
             try:
                 who = Contender.of(name, options, timed)
-                if not _able(who, timed, clock and steps):
-                    who = None
+                found[-1] = who if _able(who, timed, clock and steps) else None
             except InputError as error:
                 said.append(error)
-        found.append(who)
     if not any(found) and said:
         raise said[0]
     return found[0], found[1]

@@ -15,6 +15,7 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
+from moonteam.planners.kind import PlannerOptions
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.study import evaluation
 from sim2grid.study.evaluation import Contender, Evaluation, Row, contenders
@@ -223,11 +224,54 @@ def test_engines_are_held_against_each_other(sliding):
 
 
 def command(*words):
+    return said("--planner", "exact", "--site", "flat", "--side", "6", "--targets", "2",
+                "--width", "2", *words)
+
+
+def said(*words):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main(["evaluate", "execution", "--planner", "exact", "--site", "flat", "--side", "6",
-                     "--targets", "2", "--width", "2", *words])
+        code = main(["evaluate", "execution", *words])
     return code, out.getvalue(), err.getvalue()
+
+
+CLOCKED = "tests/evaluation/nearest.py"
+
+
+@pytest.mark.parametrize(("words", "expected"), [
+    (["--mission", "demo", "demo"], "--mission: give each once"),
+    (["--mission", "demo", "--count", "3"], "--count: is for random missions"),
+    (["--mission", "demo", "--team", "drone"], "--team: is for random missions"),
+    (["--mission", "outpots"], "outpots: no such file, nor one of the bundled missions"),
+    (["--mission", "demo", "sampling"], "sampling: clock: is by the clock, which --mode clock"),
+    (["--dem", "none.tif"], "none.tif: no such file"),
+    (["--dem", "examples/ground/rim.tif", "--centre", "30", "0"],
+     "rim.tif: is too small: 32 by 32 m of ground are needed around 30 m east, 0 m north"),
+    (["--dem", "examples/ground/rim.tif", "--units", "degrees", "--centre", "98", "0"],
+     "rim.tif: centre: 98, 0 is not allowed; a latitude"),
+    (["--dem", "examples/ground/rim.tif", "--rotation", "nan"], "rim.tif: rotation: nan is not"),
+])
+def test_what_is_asked_of_ones_own_in_vain_gets_one_line(words, expected, tmp_path):
+    code, text, err = said(*words, "--planner", "exact", "--out", str(tmp_path / "out"))
+    assert (code, text) == (2, "")
+    assert expected in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out" / "config.json").exists()
+
+
+def test_planners_decide_in_the_modes_that_they_can():
+    options = PlannerOptions()
+    mine = "examples/nearest_planner.py:NearestPlanner"
+    steps, timed = evaluation.deciders(mine, options, ("barrier", "clock"))
+    assert (steps.who, timed) == ("NearestPlanner", None)
+    steps, timed = evaluation.deciders(f"{CLOCKED}:Nearest", options, ("async", "clock"))
+    assert (steps, timed.who) == (None, "Nearest")
+    steps, timed = evaluation.deciders("exact", options, ("async", "clock"))
+    assert (steps.who, timed.who) == ("exact", "exact")
+    assert evaluation.deciders("exact", options, ("clock",))[0] is None
+    rows = contenders(["closed"], ["async", "clock"], [steps], ["native"],
+                      [msgspec.structs.replace(timed, planner=f"{CLOCKED}:Nearest")])
+    assert [c.name for c in rows] == ["closed exact async", "closed Nearest clock"]
 
 
 def test_the_command_writes_its_folder_and_goes_on_where_it_was_stopped(
@@ -283,6 +327,14 @@ def test_an_interrupted_command_saves_what_is_done(sliding, tmp_path, monkeypatc
     (["--loop", "open", "open"], "--loop: give each once"),
     (["--new-targets", "20", "--count", "1"], "22 targets"),
     (["--planner", "policy", "--policy", "nobody", "--count", "1"], "nobody: no such file"),
+    (["--mission", "demo"], "--site: is for random missions; those of --mission say it"),
+    (["--team", "wheled"], "--team: wheled: no such robot kind; did you mean wheeled?"),
+    (["--dem", "none.tif"], "--site: give presets or an elevation model, not both"),
+    (["--detrend"], "--detrend: is for an elevation model; give --dem too"),
+    (["--planner", f"{CLOCKED}:Nearest"], "has no reset; a planner has reset and act"),
+    (["--planner", "examples/nearest_planner.py:NearestPlanner", "--mode", "clock"],
+     "has no plan; a planner by the clock has plan(moment)"),
+    (["--planner", f"{CLOCKED}:NOT_A_PLANNER"], "a planner is a class, or a function"),
 ])
 def test_mistakes_get_one_line_and_nothing_runs(sliding, words, expected):
     code, text, err = command(*words)

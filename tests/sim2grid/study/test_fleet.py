@@ -1,15 +1,20 @@
 """Random missions on a site: drawn from seeds, legal on their ground, with events at random."""
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 
+from moonteam.errors import InputError
 from moonteam.planners import simulate
 from moonteam.planners.base import Snapshot
 from moonteam.planners.exact import ExactPlanner
+from moonteam.problem.mission import Site
+from moonteam.robots import OWN
 from sim2grid.loop.prepare import prepare
 from sim2grid.loop.replan import unsolvable
-from sim2grid.study.fleet import Rates, Recipe, make_fleet
+from sim2grid.study.fleet import Given, Rates, Recipe, make_fleet, parse_team
 
 RECIPE = Recipe("highland", 3, 7, num_targets=3, side=10, max_steps=64)
 
@@ -91,3 +96,102 @@ def test_a_rate_of_one_event_does_not_move_another():
     both = make_fleet(msgspec_replace(flat, rates=Rates(lose=1.0, silent=1.0)), 2)
     for few, many in zip(one.missions, both.missions, strict=True):
         assert set(few.events) < set(many.events)
+
+
+SCOUT = str(Path(__file__).parents[3] / "examples/scout/scout.py:SCOUT")
+
+
+def test_a_team_is_read_from_its_words():
+    team, skills = parse_team(f"drone:AB, wheeled ,{SCOUT}:drill+camera,wheeled:A")
+    assert team == (("hopper", "drone"), ("rover", "wheeled"), ("scout", SCOUT),
+                    ("rover2", "wheeled"))
+    assert skills == (("A", "B"), (), ("drill", "camera"), ("A",))
+    assert parse_team("legged,drone") == ((("strider", "legged"), ("hopper", "drone")), ())
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("", "--team: : no such robot kind; registered: drone, legged, wheeled"),
+    ("wheled:A", "--team: wheled: no such robot kind; did you mean wheeled?"),
+    ("drone:A,,wheeled:B", "--team: : no such robot kind"),
+    ("drone:", "--team: 'drone:' is not allowed; KIND or KIND:SKILLS"),
+    ("drone:AA", "'drone:AA' is not allowed"),
+    ("drone:drill+", "'drone:drill+' is not allowed"),
+    ("drone:A B", "'drone:A B' is not allowed"),
+    ("none.py:ROVER:A", "--team: none.py: no such file"),
+    (SCOUT.replace(":SCOUT", ":SCUOT"), "holds no 'SCUOT'; did you mean SCOUT?"),
+    ("drone:a+b+c+d+e+f+g+h+i", "--team: too many different skills; at most 8"),
+    (",".join(["drone"] * 257), "--team: 257 robots; at most 256"),
+])
+def test_what_is_no_team_is_one_line(text, words):
+    with pytest.raises(InputError) as refused:
+        parse_team(text)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory):
+    """Missions of a team of one's own, with all that can happen, on ground of one's own."""
+    folder = tmp_path_factory.mktemp("moon")
+    heights = 0.02 * np.arange(14.0)[None, :] + np.zeros((14, 14))
+    heights[:, :4] += 3.0 * (4 - np.arange(4.0))  # a wall in the west, for flying robots alone
+    np.save(folder / "wall.npy", heights)
+    team, skills = parse_team(f"{SCOUT}:drill,drone:camera+drill")
+    site = Site(dem=str(folder / "wall.npy"), pixel=1.0, detail=False)
+    return Recipe("wall", 5, 7, 3, 12, 1.0, 64, Rates(new_targets=1, impassable=1), team,
+                  skills=skills, ground=site)
+
+
+def test_missions_of_an_outside_team_stand_on_outside_ground(outside):
+    fleet = make_fleet(outside, 3)
+    assert fleet.place == ("wall", 0)
+    assert set(fleet.passable) == {"scout", "drone"}
+    assert fleet.passable["drone"].all()
+    assert not fleet.passable["scout"][:, :2].any()  # the wall
+    assert fleet.passable["scout"][:, 5:].all()
+    for number, mission in enumerate(fleet.missions):
+        assert mission.name == f"wall-5-{number}"
+        assert [(r.name, r.kind, r.skills) for r in mission.robots] == [
+            ("scout", "scout", ("drill",)), ("hopper", "drone", ("camera", "drill"))]
+        assert {s for target in mission.targets for s in target.skills} <= {"camera", "drill"}
+        assert mission.robots[0].start[0] >= 2
+        (closed,) = [event.impassable for event in mission.events if event.impassable]
+        assert closed.kind == "scout"
+        written = fleet.entry(number)
+        assert written.robots[0].kind == SCOUT
+        assert [e.impassable.kind for e in written.events if e.impassable] == [SCOUT]
+        alone = prepare(written, "test")
+        assert alone.mission == mission
+        assert alone.scenario == fleet.scenarios[number]
+        np.testing.assert_array_equal(alone.scene.qpos0, fleet.starts[number])
+
+
+def test_skills_that_are_given_are_kept_and_others_are_drawn():
+    team, skills = parse_team("drone:A,wheeled,legged:C")
+    fleet = make_fleet(Recipe("flat", 0, 1, 2, 8, team=team, skills=skills), 6)
+    drawn = {mission.robots[1].skills for mission in fleet.missions}
+    assert len(drawn) > 1
+    assert {s for its in drawn for s in its} == {"A", "C"}
+    assert {mission.robots[0].skills for mission in fleet.missions} == {("A",)}
+
+
+def test_the_default_team_draws_as_before(fleet):
+    team, _ = parse_team(",".join(OWN))
+    again = make_fleet(msgspec_replace(RECIPE, team=team), 2)
+    assert again.missions == fleet.missions[:2]
+
+
+def test_ground_that_no_robot_can_stand_on_is_said(tmp_path):
+    np.save(tmp_path / "steep.npy", 0.8 * np.arange(20.0)[None, :] + np.zeros((20, 20)))
+    ground = Site(dem=str(tmp_path / "steep.npy"), pixel=1.0, detail=False)
+    recipe = Recipe("steep", 2, 0, 1, 6, team=parse_team("drone,wheeled")[0], ground=ground)
+    with pytest.raises(InputError, match="site steep 2: no cell of it is open to a wheeled robot"):
+        make_fleet(recipe, 1)
+
+
+def test_a_mission_that_is_given_is_a_fleet_of_one():
+    fleet = make_fleet(Given("demo"), 1)
+    alone = prepare(fleet.entry(0), "demo")
+    assert fleet.missions == (alone.mission,)
+    assert (fleet.place, fleet.draws) == (("missions", 0), (0,))
+    np.testing.assert_array_equal(fleet.starts, alone.scene.qpos0[None])
