@@ -198,8 +198,8 @@ def import_dem(
     Raises InputError: not readable, no data, a scale that cannot be ground, a window outside.
     """
     found = dem.window(path, piece, need=need, margin=margin, pixel=pixel, band=band, scale=scale)
-    core = found.core
-    dem.check_relief(path, core, found.pixel)
+    core, past = found.core, math.ceil(found.made_up / found.pixel)
+    dem.check_relief(path, core[past:len(core) - past, past:core.shape[1] - past], found.pixel)
     window = found.heights - (dem.plane(found.heights) if detrend else core.mean())
     sides = found.sides
     if piece.size is None and need is None:  # to the last pixel
