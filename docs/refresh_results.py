@@ -1,11 +1,11 @@
-"""Makes the tables of docs/results.md again, each by the command that stands above it.
+"""Makes the tables of docs/results/*.md again, each by the command that stands above it.
 
 A table lies between `<!-- run: COMMAND -->` and `<!-- end -->`; the command is run with
 `--markdown`, and what it prints replaces the table. With `--figure NAME.png` in the marker
 the figure of the run goes to docs/images. Usage, in the environment that has moonteam:
 
     python docs/refresh_results.py             # all tables
-    python docs/refresh_results.py timing 3x7  # those whose command holds one of the words
+    python docs/refresh_results.py timing 3x7  # those whose command or page holds one of the words
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-PAGE = Path(__file__).parent / "results.md"
+PAGES = Path(__file__).parent / "results"
+IMAGES = Path(__file__).parent / "images"
 BLOCK = re.compile(r"(<!-- run: (?P<command>[^\n]*?) -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
@@ -39,26 +40,26 @@ def made(command: str) -> str:
         if done.returncode not in (0, 1):  # 1: something in the table failed, which it shows
             raise SystemExit(f"{command}: exit code {done.returncode}")
         if figure:
-            (PAGE.parent / "images").mkdir(exist_ok=True)
-            shutil.copy(next(Path(folder).glob("*.png")), PAGE.parent / "images" / figure)
-    picture = f"\n![{Path(figure).stem}](images/{figure})\n" if figure else ""
+            IMAGES.mkdir(exist_ok=True)
+            shutil.copy(next(Path(folder).glob("*.png")), IMAGES / figure)
+    picture = f"\n![{Path(figure).stem}](../images/{figure})\n" if figure else ""
     return f"\n{done.stdout}{picture}\n"
 
 
-def main() -> None:
-    """Replaces the blocks that the words on the command line choose; saves after each."""
-    chosen = sys.argv[1:]
-    commands = [found["command"] for found in BLOCK.finditer(PAGE.read_text(encoding="utf-8"))]
-    for command in commands:
-        if chosen and not any(word in command for word in chosen):
+def refresh(page: Path, chosen: list[str]) -> None:
+    """Replaces a page's blocks that the words choose; saves after each."""
+    for found in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        command = found["command"]
+        if chosen and not any(word in command or word in page.stem for word in chosen):
             continue
         table = made(command)
 
-        def put(found: re.Match[str], command: str = command, table: str = table) -> str:
-            return found[1] + table if found["command"] == command else found[0]
+        def put(block: re.Match[str], command: str = command, table: str = table) -> str:
+            return block[1] + table if block["command"] == command else block[0]
 
-        PAGE.write_text(BLOCK.sub(put, PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+        page.write_text(BLOCK.sub(put, page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    for one in sorted(PAGES.glob("*.md")):
+        refresh(one, sys.argv[1:])
