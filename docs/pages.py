@@ -33,6 +33,15 @@ NO_BREAK = "\u00a0"
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Pages beside this file that the navigation does not name are guides."""
+    nav: list[dict[str, Any]] = config.nav or []
+    named = set(re.findall(r"[\w./-]+\.md", json.dumps(nav)))
+    guides = next(section["Guides"] for section in nav if "Guides" in section)
+    guides += [page.name for page in sorted(DOCS.glob("*.md")) if page.name not in named]
+    return config
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the pages that are made, and what they show."""
     for notebook in sorted(DOCS.glob("tutorials/*.ipynb")):
@@ -139,7 +148,8 @@ def _shown(output: dict[str, Any], stem: str, pictures: dict[str, bytes]) -> str
     if "image/png" in data:
         name = f"{stem}-{len(pictures) + 1}.png"
         pictures[name] = base64.b64decode("".join(data["image/png"]))
-        return f"![What the cell above shows]({name})"
+        width = output.get("metadata", {}).get("image/png", {}).get("width", 640)
+        return f"![What the cell above shows]({name}){{: width={width} }}"
     if "text/html" in data:
         return "".join(data["text/html"])
     text = "".join(output.get("text", data.get("text/plain", "")))

@@ -16,10 +16,8 @@ from traitlets.config import Config
 
 TOP = Path(__file__).parents[1]
 TUTORIALS = TOP / "docs" / "tutorials"
-SECONDS = 900
-"""That one cell may take, on a machine however busy."""
-LOCAL = Config({"KernelManager": {"transport": "ipc"}})
-"""Sockets of the file system: nothing listens on a port."""
+SECONDS = 1800
+"""That a kernel may take to start, and one cell, on a machine however busy."""
 
 
 def executed(path: Path, workspace: Path) -> nbformat.NotebookNode:
@@ -32,8 +30,11 @@ def executed(path: Path, workspace: Path) -> nbformat.NotebookNode:
     here = workspace / "docs" / "tutorials"
     here.mkdir(parents=True)
     book = nbformat.read(path, as_version=4)
-    NotebookClient(book, timeout=SECONDS, kernel_name="python3", record_timing=False,
-                   config=LOCAL, resources={"metadata": {"path": str(here)}}).execute()
+    with tempfile.TemporaryDirectory() as sockets:  # of the file system: no port is listened on
+        kernel = Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets}/kernel"}})
+        NotebookClient(book, timeout=SECONDS, startup_timeout=SECONDS, kernel_name="python3",
+                       config=kernel, record_timing=False, coalesce_streams=True,
+                       resources={"metadata": {"path": str(here)}}).execute()
     return book
 
 

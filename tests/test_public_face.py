@@ -15,7 +15,7 @@ from moonteam.policies.policy import Policy
 from moonteam.robots import KINDS
 
 TOP = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/python.md")
+PAGES = ("README.md", "docs/python.md", "docs/api/grid.md", "docs/own/planner.md")
 
 
 @pytest.fixture(autouse=True)

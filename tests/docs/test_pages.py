@@ -111,3 +111,11 @@ COMMANDS = [
 def test_commands_of_the_pages_are_understood(line):
     name, words = cli.find_command(shlex.split(line, comments=True)[1:])
     cli.parse(name, words)
+
+
+def test_the_two_commands_of_the_readme_are_what_ci_runs():
+    told = re.findall(r"(?m)^make (\w+)", (TOP / "README.md").read_text(encoding="utf-8"))
+    assert told == ["demo", "test"]
+    for name in told:
+        assert f"time make {name}\n" in (TOP / ".ci/run").read_text(encoding="utf-8")
+        assert f"\n{name}: " in (TOP / "Makefile").read_text(encoding="utf-8")
