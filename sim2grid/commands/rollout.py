@@ -369,6 +369,7 @@ def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], 
     import yaml
 
     from sim2grid.show import page, plots
+    from sim2grid.show.replay import replay
 
     mission = msgspec.to_builtins(made.prepared.written)
     page.write(out / "report.html", page.rollout_page(
@@ -376,12 +377,14 @@ def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], 
         replans=[(round(r.time_s, 1), r.decision, r.words) for r in film.story.replans],
         plots=[("Who did what when", plots.timeline(film.story)),
                ("Motion", plots.motion(film.story, film.bases))],
-        mission=yaml.safe_dump(mission, sort_keys=False, default_flow_style=None)))
+        mission=yaml.safe_dump(mission, sort_keys=False, default_flow_style=None),
+        replay=replay(film.story, made.prepared)))
 
 
 def _save_paths(film: Film, out: Path) -> None:
-    with files.replacing(out / "paths.png") as temporary:
-        film.last_map(960).save(temporary)
+    from sim2grid.show import plots
+
+    plots.save_png(plots.paths(film.story, film.ground, film.barred), out / "paths.png")
 
 
 def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:

@@ -36,7 +36,18 @@ th,td{padding:5px 9px;border-bottom:1px solid #262d3f}td.n,th.n{text-align:right
 video,img{max-width:100%;border-radius:8px}.plot img{display:block;width:100%}
 .two{display:grid;grid-template-columns:1fr 1fr;gap:12px}
 pre,code{background:#181d2b;border-radius:6px;font-size:12px}pre{padding:10px;overflow-x:auto}
-code{padding:1px 5px}summary{cursor:pointer;color:#9fb4d8}
+code{padding:1px 5px;overflow-wrap:anywhere}summary{cursor:pointer;color:#9fb4d8}
+.replay canvas{display:block;width:100%;border-radius:8px;touch-action:none}
+.stage{position:relative}.told{position:absolute;left:10px;top:8px;right:10px;font-size:13px;
+ font-weight:600;text-shadow:0 0 4px #000,0 0 4px #000;pointer-events:none}
+.ticks{position:relative;height:12px;margin:6px 8px 0}.ticks i{position:absolute;width:3px;
+ height:12px;margin-left:-1px;border-radius:1px;cursor:pointer}.clock{width:100%;margin:2px 0 6px}
+.keys{display:flex;flex-wrap:wrap;gap:10px;align-items:center;font-size:13px}.keys output{
+ font-variant-numeric:tabular-nums;min-width:110px}button,select{background:#181d2b;color:inherit;
+ border:1px solid #262d3f;border-radius:6px;padding:4px 10px;font:inherit;cursor:pointer}
+.team{display:flex;flex-wrap:wrap;gap:6px}.events li{cursor:pointer;opacity:.5;font-size:13px}
+.events li.past{opacity:1}
+@media(max-width:640px){body{padding:12px}.two{grid-template-columns:1fr}h1{font-size:21px}}
 """
 
 
@@ -140,7 +151,7 @@ def requirement(skills: Sequence[str], kind: str) -> str:
 def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
                  replans: Sequence[tuple[float, int, str]] = (),
                  plots: Sequence[tuple[str, str]] = (), timing: dict[str, float] | None = None,
-                 mission: str = "") -> str:
+                 mission: str = "", replay: str = "") -> str:
     """A rollout's page.
 
     Args:
@@ -152,6 +163,7 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
       plots: (title, SVG).
       timing: wall-clock times.
       mission: the mission file's text.
+      replay: in 3-D, as `replay.replay` makes it.
     """
     verdict = '<span class="good">success</span>' if report.success else (
         f'<span class="bad">failed: {html.escape((report.cause or "").replace("_", " "))}</span>')
@@ -171,6 +183,7 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
                ("inflation", report.inflation)]), ("moves", report.moves),
             ("causes of new plans", len(replans)),
             ("times real time", (timing or {}).get("real_time_factor"))]),
+        *(["<h2>Replay in 3-D</h2>", replay] if replay else []),
         "<h2>Video</h2>", video(made, out),
         "<h2>Targets</h2>", _targets(report), "<h2>Robots</h2>", _robots(report),
         *([] if not replans else ["<h2>New plans</h2>", table(

@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 import io
+import math
+import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from moonteam import files
 from sim2grid.frame import tilt
 from sim2grid.measure.story import Story
-from sim2grid.show.picture import GREY, INK, NIGHT, OPEN, REPLAN, SOLVED, STATES, Color, robot_color
+from sim2grid.show.picture import (
+    BARRED,
+    GREY,
+    INK,
+    NIGHT,
+    OPEN,
+    REPLAN,
+    SOLVED,
+    STATES,
+    Color,
+    Ground,
+    hillshade,
+    requirement,
+    robot_color,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,6 +77,96 @@ def timeline(story: Story) -> str:
     axis.set_xlim(0.0, end * 1.01 + 0.01)
     axis.set_xlabel("mission time, s")
     return svg(figure)
+
+
+def paths(story: Story, ground: Ground, barred: npt.NDArray[np.bool_] | None = None) -> Figure:
+    """The map with every way: axes and a scale in metres, starts, planned and driven ways,
+    targets by state, new plans.
+
+    `barred` [H, W] are cells that some robot cannot enter.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Rectangle
+
+    frame, record = story.frame, story.record
+    half = np.array(frame.size) * frame.cell_m / 2
+    side = 8.4 * half / half.max()
+    figure, (axis,) = _axes(side[0] + 0.8, side[1] + 1.2, 1)
+    _ground(axis, ground, half)
+    for y, x in np.argwhere(barred) if barred is not None else ():
+        axis.add_patch(Rectangle((x * frame.cell_m - half[0], y * frame.cell_m - half[1]),
+                                 frame.cell_m, frame.cell_m, color=hexed(BARRED), alpha=0.45, lw=0))
+    for leg in record.legs:
+        axis.plot(*zip(leg.start_xy, leg.waypoint, strict=True), lw=6, alpha=0.3,
+                  color=hexed(robot_color(leg.robot)))
+    for i, path in enumerate(story.paths):
+        color = hexed(robot_color(i))
+        axis.plot(*path.T, color=color, lw=1.8)
+        axis.plot(*path[0], "o", ms=9, mfc=hexed(NIGHT), mec=color, mew=2.0)
+        known = path[np.isfinite(path).all(axis=1)]
+        axis.plot(*known[-1], "o", ms=9, mfc=color, mec=hexed(NIGHT), mew=1.0)
+    for j, target in enumerate(record.targets):
+        color = hexed(SOLVED if any(s.target == j for s in record.solves) else OPEN)
+        centre = frame.centre(np.array(target.at, float))
+        axis.add_patch(Rectangle(centre - 0.46 * frame.cell_m, 0.92 * frame.cell_m,
+                                 0.92 * frame.cell_m, fill=False, ec=color, lw=2.0))
+        _named(axis, f"{record.target_names[j]} {requirement(target)}", centre, color)
+    for replan in story.replans:
+        if replan.xy is not None:
+            axis.plot(*replan.xy, "D", color=hexed(REPLAN), mec=hexed(NIGHT), ms=7)
+    _scale(axis, half)
+    kinds = [Line2D([], [], color=hexed(INK), lw=6, alpha=0.3, label="planned"),
+             Line2D([], [], color=hexed(INK), label="driven"),
+             Line2D([], [], color=hexed(INK), marker="o", ls="", mfc=hexed(NIGHT), label="start")]
+    team = [Line2D([], [], color=hexed(robot_color(i)), lw=3, label=robot.name)
+            for i, robot in enumerate(story.mission.robots)]
+    axis.legend(handles=team + kinds, ncols=6, loc="upper center", bbox_to_anchor=(0.5, -0.07),
+                frameon=False, labelcolor=hexed(INK), fontsize=9)
+    return figure
+
+
+def _ground(axis: Axes, ground: Ground, half: npt.NDArray) -> None:
+    """Hill shade under a map of `half` widths [2] m, with axes in metres."""
+    reach = (np.array(ground.heights.shape[::-1]) - 1) * ground.spacing / 2
+    axis.imshow(hillshade(ground.heights, ground.spacing), cmap="gray", vmin=0, vmax=255,
+                origin="lower", extent=(-reach[0], reach[0], -reach[1], reach[1]))
+    axis.set_xlim(-half[0], half[0])
+    axis.set_ylim(-half[1], half[1])
+    axis.set_aspect("equal")
+    axis.grid(False)
+    axis.set_xlabel("east, m")
+    axis.set_ylabel("north, m", color=hexed(INK), fontsize=8)
+
+
+def _named(axis: Axes, text: str, at: npt.NDArray, color: str) -> None:
+    """A name under a target, or above it in the south, where there would be no room."""
+    from matplotlib.patheffects import withStroke
+
+    low, high = axis.get_ylim()
+    below = at[1] - low > 0.08 * (high - low)
+    axis.annotate(text, tuple(at), xytext=(0, -14 if below else 14), textcoords="offset points",
+                  ha="center", va="top" if below else "bottom", fontsize=9, fontweight="bold",
+                  color=color, path_effects=[withStroke(linewidth=2.5, foreground=hexed(NIGHT))])
+
+
+def _scale(axis: Axes, half: npt.NDArray) -> None:
+    """A bar of about a fifth of the map, in a length that is easily read."""
+    wanted = 0.4 * float(half[0])
+    power = 10.0 ** math.floor(math.log10(wanted))
+    length = max(power * n for n in (1, 2, 5) if power * n <= wanted)
+    x, y = 0.95 * half[0] - length, -0.95 * half[1]
+    axis.plot([x, x + length], [y, y], color=hexed(INK), lw=4, solid_capstyle="butt")
+    axis.annotate(f"{length:g} m", (x + length / 2, y), xytext=(0, 5), ha="center",
+                  textcoords="offset points", fontsize=9, color=hexed(INK))
+
+
+def save_png(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Writes a figure as PNG, whole or not at all."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    with files.replacing(path) as temporary:
+        FigureCanvasAgg(figure).figure.savefig(temporary, format="png", dpi=120,
+                                               facecolor=hexed(NIGHT))
 
 
 def motion(story: Story, bases: Sequence[int]) -> str:
