@@ -246,8 +246,4 @@ def _print(args: Args, report: dict[str, Any]) -> None:
     elif args.markdown:
         print(plain_markdown(report, tables(report)))
     else:
-        (titles, rows), *more = tables(report)
-        heads = ["\n".join([row[0], " ".join(word for word in row[1:4] if word != "-")])
-                 for row in rows]
-        turned = [[title, *(row[k] for row in rows)] for k, title in enumerate(titles) if k > 3]
-        show_plain(report, [(["", *heads], turned), *more])
+        show_plain(report, tables(report))

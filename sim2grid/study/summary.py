@@ -24,7 +24,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from moonteam.report.intervals import NOTHING, Bootstrap, Figure, wilson
+from moonteam.report.intervals import Bootstrap, Figure, share
+from moonteam.report.tables import Plain
 from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import Report, RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
@@ -76,8 +77,8 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
     decisions = values(lambda row: row.report.decisions, won)
     sent = values(lambda row: sum(map(legs_sent, row.report.robots)))
     figures = {
-        "success": _share(int(won.sum()), len(rows)),
-        "success_solvable": _share(int((won & able).sum()), int(able.sum())),
+        "success": share(won),
+        "success_solvable": share(won & able, able),
         "seconds": boot.mean(seconds),
         "decisions": boot.mean(decisions),
         "moves": boot.mean(values(lambda row: row.report.moves, won)),
@@ -90,9 +91,9 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         **{key: boot.mean(values(partial(_a_robot, key=key), won))
            for key in ("driving_s", "slower_s", "service_s")},
         "over_plan": boot.ratio(seconds, values(lambda row: row.report.expected_s, won)),
-        "wrong_cell_rate": boot.ratio(values(
+        "wrong_cell_rate": share(values(
             lambda row: sum(robot.wrong_cells for robot in row.report.robots)), sent),
-        "timeout_rate": boot.ratio(values(
+        "timeout_rate": share(values(
             lambda row: sum(robot.timeouts for robot in row.report.robots)), sent),
         "replans": boot.mean(values(lambda row: sum(row.report.replans.values()))),
         "cross_track_rms_m": boot.mean(values(lambda row: _mean(
@@ -113,10 +114,6 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         "replans_by_cause": dict(sorted(causes.items())),
         "intervals": {key: _ends(figure) for key, figure in figures.items()},
     }
-
-
-def _share(hits: int, count: int) -> Figure:
-    return Figure(hits / count, *wilson(hits, count)) if count else NOTHING
 
 
 def _a_robot(row: Row, key: str) -> float | None:
@@ -233,7 +230,7 @@ def _why(row: Row, twin: Row) -> str:
 def notes(options: dict[str, Any]) -> list[str]:
     """What must be known to read the tables."""
     found = ["seconds, decisions, energy: means over the missions that succeeded; brackets: 95 % "
-             "bootstrap intervals over missions, of success Wilson's",
+             "intervals, of rates by Wilson, else by bootstrap over missions",
              "decisions / plan: over those of the same planner on the grid alone; seconds / ideal: "
              "over the grid plan at travelling speed"]
     found += [LACKS] if "fused" in options.get("backend", ()) else []
@@ -244,8 +241,6 @@ def notes(options: dict[str, Any]) -> list[str]:
                      "made unsolvable")
     return found
 
-
-Table = tuple[list[str], list[list[str]]]
 
 BY_THE_CLOCK = ["site", "planner", "s by ways alone", "s as planned", "s driven",
                 "driven / planned", "driven / ways alone"]
@@ -267,7 +262,7 @@ def where(line: dict[str, Any]) -> str:
     return line["site"] if line["site"] == GIVEN else f"{line['site']} {line['site_seed']}"
 
 
-def tables(report: dict[str, Any]) -> list[Table]:
+def tables(report: dict[str, Any]) -> list[Plain]:
     """Summary, missions that were given, comparisons, failures, for Markdown or a terminal."""
     events = any(report["options"].get("rates", {}).values())
     titles = ["site", "loop", "planner", "mode", "success"]
@@ -289,7 +284,7 @@ def tables(report: dict[str, Any]) -> list[Table]:
                   _value(line["replans"], 2), str(line["falls"]), str(line["stuck"])
                   ] if physical else ["-"] * 7
         rows.append(cells)
-    found: list[Table] = [(titles, rows)]
+    found: list[Plain] = [(titles, rows)]
     if clocked := [line for line in report["summary"] if line["mode"] == "clock"]:
         found.append((BY_THE_CLOCK, [[
             where(line), line["planner"], spread(line, "optimum", 1),

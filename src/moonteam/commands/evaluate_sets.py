@@ -83,7 +83,8 @@ def run(args: Args) -> int:
                   f"{args.best_of}: planning time is the whole set's, played in batches, over its "
                   "scenarios.",
                   "5x20 and 8x40 are held against the best known plans, the others against "
-                  "certified optima. In brackets: 95 % bootstrap intervals."],
+                  "certified optima. In brackets: 95 % intervals, of success by Wilson, else "
+                  "bootstrap."],
         "meta": provenance.meta(command.line("evaluate sets", args), args.seed)}
     columns = _columns(args.best_of)
     if args.out:

@@ -13,13 +13,12 @@ really made:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.report.intervals import Bootstrap, Figure
+from moonteam.report.intervals import Bootstrap, Figure, share
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
@@ -77,7 +76,7 @@ def figures(outcomes: Outcomes, family: Family, reference: Reference,
     time_gap = bootstrap.ratio(outcomes.steps, reference.makespan)
     effort_gap = bootstrap.ratio(outcomes.moves, reference.moves)
     return {
-        "success": bootstrap.mean(outcomes.success),
+        "success": share(outcomes.success),
         "makespan": bootstrap.mean(outcomes.steps),
         "moves": bootstrap.mean(outcomes.moves),
         "M_st": bootstrap.mean(slack),
@@ -116,13 +115,3 @@ def rows(outcomes: Outcomes, family: Family, reference: Reference) -> list[dict]
                       "makespan": int(outcomes.steps[i]) if solved else None,
                       "moves": int(outcomes.moves[i]), "optimal": optimal})
     return found
-
-
-def never_failed(planners: Sequence[Outcomes]) -> str:
-    """What an interval of [1, 1] for success is worth: the rule of three."""
-    sizes = {len(o.success) for o in planners if o.success.all()}
-    if not sizes:
-        return ""
-    count = sizes.pop()
-    return (f"Where no scenario of {count} failed, the bootstrap cannot widen the 1; the rate of "
-            f"failure is below {min(1.0, 3 / count):.2g} with 95 % confidence (rule of three).")

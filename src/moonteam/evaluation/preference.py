@@ -84,9 +84,9 @@ def pivot(document: dict) -> tuple[list[str], list[list[str]]]:
 
 
 def _cells(row: dict) -> list[str]:
-    """Success, mean T and mean moves, the latter two with their interval."""
-    found = [f"{row['success']:.3f}"]
-    for key in ("makespan", "moves"):
-        low, high = row["intervals"][key]
-        found.append(f"{row[key]:.2f} [{low:.2f}, {high:.2f}]")
+    """Success, mean T and mean moves, with their intervals."""
+    found = []
+    for key, digits in zip(KEYS, (3, 2, 2), strict=True):
+        ends = ", ".join(f"{end:.{digits}f}" for end in row["intervals"][key])
+        found.append(f"{row[key]:.{digits}f} [{ends}]")
     return found

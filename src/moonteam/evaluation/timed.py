@@ -21,7 +21,7 @@ from moonteam.planners.seconds.base import MS, Moment, TimedPlan, TimedPlanner
 from moonteam.planners.seconds.registry import TimedPlannerKind
 from moonteam.problem.timed import Timed
 from moonteam.report import provenance, tables
-from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure
+from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure, share
 from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.progress import track
 from moonteam.report.tables import Column
@@ -244,8 +244,8 @@ def evaluate(problems: Sequence[Timed], rows: Sequence[Contender], seed: int, ti
              "file states." if known else "No optimum is known: no gaps.",
              "Makespan: when the last service has ended and everybody with a home is there; "
              "effort: the team's time under way; both in the set's own unit of time.",
-             f"In brackets: 95 % bootstrap intervals over {len(problems)} problems, "
-             f"{RESAMPLES} resamples.",
+             f"In brackets: 95 % intervals over {len(problems)} problems: of shares by Wilson, "
+             f"else bootstrap, {RESAMPLES} resamples.",
              *(f"{row.name}: planning time is the whole set's, planned in one call, over its "
                "problems; --alone plans one at a time." for row in rows if row.together),
              *faults(found)]
@@ -292,12 +292,11 @@ def summary(done: Outcomes, optimal: Sequence[float | None], bootstrap: Bootstra
     makespan = column([r.makespan for r in results])
     gap = bootstrap.ratio(makespan, column(optimal))
     found = {
-        "success": bootstrap.mean(column([float(r.success) for r in results])),
+        "success": share([float(r.success) for r in results]),
         "makespan": bootstrap.mean(makespan),
         "effort": bootstrap.mean(column([r.effort for r in results])),
         "makespan_gap": Figure(*(value - 1.0 for value in gap)),
-        "certified": bootstrap.mean(column([
-            float(r.success and r.status == "optimal") for r in results]))}
+        "certified": share([float(r.success and r.status == "optimal") for r in results])}
     return {"planner": done.planner, "scenarios": len(results),
             **{key: figure.value for key, figure in found.items()},
             "intervals": {key: [figure.low, figure.high] for key, figure in found.items()},

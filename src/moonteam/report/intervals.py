@@ -1,13 +1,16 @@
 """Intervals: bootstrap for means and for ratios of means, Wilson for shares.
 
-Every figure of a report is resampled with the same draws, scenario by scenario, so that
-planners on one set are compared on the same resampled sets. Legend: S scenarios, R draws.
+Every mean of a report is resampled with the same draws, scenario by scenario, so that
+planners on one set are compared on the same resampled sets. A share is not resampled: where all or
+none are hits no draw is otherwise, and two of two would be a certain thing. Legend: S scenarios,
+R draws.
 """
 
 from __future__ import annotations
 
 import math
 from functools import cached_property
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -28,17 +31,39 @@ class Figure(NamedTuple):
 NOTHING = Figure(math.nan, math.nan, math.nan)
 
 
-def wilson(hits: int, count: int) -> tuple[float, float]:
+def wilson(hits: float, count: float) -> tuple[float, float]:
     """The score interval of a share (Wilson 1927): honest where all or none of `count` are hits.
 
-    (0, 1) where nothing was counted.
+    (0, 1) where nothing was counted. `count` need not be whole: see `share`.
     """
-    if count == 0:
+    if count <= 0:
         return 0.0, 1.0
-    from scipy.stats import binomtest
+    z = NormalDist().inv_cdf((1 + LEVEL) / 2)
+    rate, more = hits / count, z**2 / count
+    half = z * math.sqrt(rate * (1 - rate) / count + more / (4 * count))
+    middle = rate + more / 2
+    return (0.0 if hits == 0 else (middle - half) / (1 + more),
+            1.0 if hits == count else (middle + half) / (1 + more))
 
-    found = binomtest(hits, count).proportion_ci(LEVEL, method="wilson")
-    return float(found.low), float(found.high)
+
+def share(hits: npt.ArrayLike, counts: npt.ArrayLike | None = None) -> Figure:
+    """Sum of `hits` [S] over sum of `counts` [S] (1 each if not given), with Wilson's interval.
+
+    Hits of one scenario are often alike, such as one robot's moves: the interval is that of as
+    many independent ones as would spread alike (the design effect of Rao and Scott 1992, a ratio
+    of variances; at least 1). Entries that are not a number are left out.
+    """
+    top = np.asarray(hits, np.float64)
+    bottom = np.ones_like(top) if counts is None else np.asarray(counts, np.float64)
+    known = np.isfinite(top) & np.isfinite(bottom)
+    top, bottom = top[known], bottom[known]
+    count = float(bottom.sum())
+    if count == 0.0:
+        return NOTHING
+    rate = float(top.sum()) / count
+    alone = rate * (1 - rate) * count
+    effect = max(1.0, float(((top - rate * bottom) ** 2).sum()) / alone) if alone > 0 else 1.0
+    return Figure(rate, *wilson(rate * count / effect, count / effect))
 
 
 class Bootstrap:

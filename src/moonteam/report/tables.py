@@ -5,13 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from moonteam import files
 from moonteam.report.provenance import hardware_line
+
+Plain = tuple[list[str], list[list[str]]]
+"""A table of plain cells: titles, rows."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ def save(folder: Path, document: dict, columns: Sequence[Column]) -> None:
     files.write_text(folder / "table.md", markdown(document, columns) + "\n")
 
 
-def plain_markdown(document: dict, tables: Sequence[tuple[list[str], list[list[str]]]]) -> str:
+def plain_markdown(document: dict, tables: Sequence[Plain]) -> str:
     """Tables of plain cells (titles, rows), with command, notes and machine."""
     lines = [f"`{document['meta']['command']}`", ""]
     for titles, rows in tables:
@@ -168,29 +171,54 @@ def plain_markdown(document: dict, tables: Sequence[tuple[list[str], list[list[s
 
 
 def save_plain(folder: Path, name: str, document: dict,
-               tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
+               tables: Sequence[Plain]) -> None:
     """The document as `name`.json and its tables as table.md."""
     files.write_json(folder / f"{name}.json", document)
     files.write_text(folder / "table.md", plain_markdown(document, tables) + "\n")
 
 
-def show_plain(document: dict, tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
-    """The same on the terminal."""
+def fitted(titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[Plain]:
+    """The table if it is at most `width` wide, else turned: a title a line, its rows side by side,
+    as many in a table as there is room for.
+    """
+    if _width([titles, *rows]) <= width or not rows:
+        return [(list(titles), [list(row) for row in rows])]
+    found, first = [], 0
+    while first < len(rows):
+        last = first + 1
+        while last < len(rows) and _width(zip(titles, *rows[first:last + 1], strict=True)) <= width:
+            last += 1
+        head, *rest = zip(titles, *rows[first:last], strict=True)
+        found.append((list(head), [list(line) for line in rest]))
+        first = last
+    return found
+
+
+def _width(lines: Iterable[Sequence[str]]) -> int:
+    """How wide a printed table is: its widest cells, two spaces and a rule each."""
+    return sum(max(len(part) for cell in column for part in (cell.splitlines() or [""])) + 3
+               for column in zip(*lines, strict=True)) + 1
+
+
+def show_plain(document: dict, tables: Sequence[Plain]) -> None:
+    """The same on the terminal; what is wider is turned."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console()
     for titles, rows in tables:
-        table = Table(*titles)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
+        for head, lines in fitted(titles, rows, console.width):
+            table = Table(*map(escape, head))
+            for line in lines:
+                table.add_row(*map(escape, line))
+            console.print(table)
     for note in (*document["notes"], hardware_line(document["meta"])):
         console.print(note, highlight=False, markup=False)
 
 
 def print_plain(args: Any, document: dict,
-                tables: Sequence[tuple[list[str], list[list[str]]]]) -> None:
+                tables: Sequence[Plain]) -> None:
     """The document as `--json` or `--markdown` ask for it, else its tables for a person."""
     print_as(args, document, lambda: plain_markdown(document, tables),
              lambda: show_plain(document, tables))
