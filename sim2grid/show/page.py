@@ -24,7 +24,7 @@ LARGEST_VIDEO = 20_000_000
 STYLE = """
 :root{color-scheme:dark}
 body{background:#0e111a;color:#ebeef5;font:15px/1.45 system-ui,'DejaVu Sans',sans-serif;
- margin:0 auto;max-width:1000px;padding:24px}
+ margin:0 auto;max-width:1180px;padding:24px}
 h1{font-size:26px;margin:0 0 4px}h2{font-size:18px;margin:32px 0 10px;color:#9fb4d8}
 .sub{color:#aab2c3;margin:0 0 18px}.good{color:#46d76e}.bad{color:#ff6a4c}.dim{color:#8a93a6}
 .tiles{display:flex;flex-wrap:wrap;gap:10px}.tile{background:#181d2b;border-radius:8px;
@@ -47,7 +47,21 @@ code{padding:1px 5px;overflow-wrap:anywhere}summary{cursor:pointer;color:#9fb4d8
  border:1px solid #262d3f;border-radius:6px;padding:4px 10px;font:inherit;cursor:pointer}
 .team{display:flex;flex-wrap:wrap;gap:6px}.events li{cursor:pointer;opacity:.5;font-size:13px}
 .events li.past{opacity:1}
-@media(max-width:640px){body{padding:12px}.two{grid-template-columns:1fr}h1{font-size:21px}}
+.cards{display:grid;gap:14px}article{background:#131826;border-radius:10px;padding:10px 14px;
+ min-width:0;content-visibility:auto;contain-intrinsic-size:auto 320px}h3{margin:0 0 6px;
+ font-size:15px}.run{display:grid;grid-template-columns:170px minmax(0,1fr);gap:14px;
+ margin-top:10px}
+svg.map{width:100%;border-radius:6px}.gantt text{font-size:11px}.map text{font-weight:700;
+ text-anchor:middle;paint-order:stroke;stroke:#0e111a}.gantt .who{text-anchor:end;font-weight:600}
+.gantt .what{text-anchor:end;fill:#0e111a;font-size:10px;font-weight:700}
+.gantt .axis{text-anchor:middle;font-size:10px;fill:#aab2c3}
+.film pre{white-space:pre-wrap;overflow-wrap:anywhere}.film p{margin:6px 0 0}
+@media(max-width:640px){body{padding:12px}.two,.run{grid-template-columns:1fr}h1{font-size:21px}
+ svg.map{max-width:240px}.gantt text{font-size:17px}.gantt .what,.gantt .axis{font-size:14px}
+ thead{display:none}table,tbody,tr,td{display:block}tr{padding:6px 0;
+  border-bottom:1px solid #262d3f}
+ td,td.n{border:0;padding:1px 0;text-align:left;overflow-wrap:anywhere}
+ td::before{content:attr(data-title) " ";color:#8a93a6}}
 """
 
 
@@ -87,10 +101,19 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
                for k in range(len(head))]
     kind = [' class="n"' if number else "" for number in numbers]
     top = "".join(f"<th{k}>{html.escape(word)}</th>" for k, word in zip(kind, head, strict=True))
-    lines = "\n".join("<tr>" + "".join(f"<td{k}>{cell(v)}</td>" for k, v in zip(
-        kind, row, strict=True)) + "</tr>" for row in body)
+    # A narrow screen shows a row as a list: the titles go with the cells.
+    said = [f' data-title="{html.escape(word)}"' for word in head]
+    lines = "\n".join("<tr>" + "".join(f"<td{k}{t}>{cell(v)}</td>" for k, t, v in zip(
+        kind, said, row, strict=True)) + "</tr>" for row in body)
     return f'<div class="wide"><table><thead><tr>{top}</tr></thead>\n<tbody>{lines}</tbody>' \
            "</table></div>"
+
+
+def known(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table of the columns in which something is known."""
+    body = [list(row) for row in rows]
+    kept = [k for k in range(len(head)) if any(row[k] is not None for row in body)]
+    return table([head[k] for k in kept], [[row[k] for k in kept] for row in body])
 
 
 def tiles(pairs: Iterable[tuple[str, object]]) -> str:
@@ -151,7 +174,7 @@ def requirement(skills: Sequence[str], kind: str) -> str:
 def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
                  replans: Sequence[tuple[float, int, str]] = (),
                  plots: Sequence[tuple[str, str]] = (), timing: dict[str, float] | None = None,
-                 mission: str = "", replay: str = "") -> str:
+                 mission: str = "", replay: str = "", optimum: Sequence[str] = ()) -> str:
     """A rollout's page.
 
     Args:
@@ -164,6 +187,7 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
       timing: wall-clock times.
       mission: the mission file's text.
       replay: in 3-D, as `replay.replay` makes it.
+      optimum: lines on what the best plan would have taken.
     """
     verdict = '<span class="good">success</span>' if report.success else (
         f'<span class="bad">failed: {html.escape((report.cause or "").replace("_", " "))}</span>')
@@ -182,7 +206,9 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
               [("of the grid plan", grid.makespan if grid else None),
                ("inflation", report.inflation)]), ("moves", report.moves),
             ("causes of new plans", len(replans)),
-            ("times real time", (timing or {}).get("real_time_factor"))]),
+            *([("times real time", timing["real_time_factor"])]
+              if timing and "real_time_factor" in timing else [])]),
+        *[f'<p class="dim">{html.escape(line)}</p>' for line in optimum],
         *(["<h2>Replay in 3-D</h2>", replay] if replay else []),
         "<h2>Video</h2>", video(made, out),
         "<h2>Targets</h2>", _targets(report), "<h2>Robots</h2>", _robots(report),

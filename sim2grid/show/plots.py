@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 WIDTH = 9.6  # inches, of a plot as wide as the page
 DIM = (70, 78, 96)
+SERIES: tuple[Color, ...] = (
+    (159, 180, 216), (222, 190, 140), (150, 200, 170), (205, 155, 185), (176, 176, 176))
+"""Colours of what is compared: robots keep theirs to themselves."""
 MOST_POINTS = 600  # of a line
 
 
@@ -208,9 +211,9 @@ def intervals(names: Sequence[str], panels: Sequence[tuple[str, Sequence[Any]]])
                 continue
             mean, low, high = value
             if low is not None and high is not None:
-                axis.plot([low, high], [place, place], color=hexed(robot_color(0)), lw=4,
+                axis.plot([low, high], [place, place], color=hexed(SERIES[0]), lw=4,
                           alpha=0.45, solid_capstyle="butt")
-            axis.plot(mean, place, "o", color=hexed(robot_color(0)), ms=6)
+            axis.plot(mean, place, "o", color=hexed(SERIES[0]), ms=6)
             axis.annotate(f"{mean:.3g}", (mean, place), xytext=(0, 6), ha="center",
                           textcoords="offset points", fontsize=8, color=hexed(INK))
         axis.set_title(title, loc="left", fontsize=9, color=hexed(INK))
@@ -231,8 +234,8 @@ def histograms(title: str, groups: Mapping[str, Sequence[float]]) -> str:
     every = np.concatenate(list(kept.values()))
     low, high = float(every.min()), float(every.max())
     bins = np.linspace(low, high if high > low else low + 1.0, 31).tolist()
-    for i, (axis, (name, values)) in enumerate(zip(axes, kept.items(), strict=True)):
-        axis.hist(values, bins=bins, color=hexed(robot_color(i)), alpha=0.85)
+    for axis, (name, values) in zip(axes, kept.items(), strict=True):
+        axis.hist(values, bins=bins, color=hexed(SERIES[0]), alpha=0.85)
         axis.axvline(float(np.median(values)), color=hexed(INK), lw=1.2)
         axis.set_yticks([])
         axis.set_title(f"{name}: median {np.median(values):.3g}", loc="right", fontsize=8,
@@ -258,7 +261,7 @@ def curves(columns: Sequence[tuple[str, dict[str, Sequence[tuple[float, Any]]],
                     continue
                 x = [point[0] for point in kept]
                 mean, low, high = np.array([point[1] for point in kept], float).T
-                color = hexed(robot_color(i))
+                color = hexed(SERIES[i % len(SERIES)])
                 axis.plot(x, mean, "o-", color=color, ms=4, lw=1.5, label=name)
                 axis.fill_between(x, low, high, color=color, alpha=0.18, lw=0)
         axes[k].set_ylim(-0.03, 1.05)

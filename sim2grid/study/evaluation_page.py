@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import html
-import shlex
 from collections.abc import Callable
 from typing import Any
 
 from sim2grid.show import plots
-from sim2grid.show.page import Raw, cell, folded, mean_interval, page, plot, table, tiles
+from sim2grid.show.page import Raw, folded, known, mean_interval, page, plot, table, tiles
+from sim2grid.study.mission_cards import cards, optimum, rollout_command
 from sim2grid.study.summary import COMPARED, DIFFERENT, compared_rows, different_rows
 
 MOST_FAILURES = 200
@@ -49,28 +49,41 @@ def evaluation_page(document: dict[str, Any], source: str = "report.json") -> st
         *_section("Failures by cause", causes_table(document, source)),
         *_section("Every failed mission", failures_table(document, source)),
         "<h2>Distributions</h2>", histogram_plots(document),
+        *_section("Mission by mission", cards(document, source)),
         *[f'<p class="dim">{html.escape(note)}.</p>' for note in document.get("notes", [])],
         folded("how it was made", _lines(meta | {"options": document.get("options")}))])
-
-
-def rollout_command(source: str, number: int, contender: str) -> str:
-    """The command that shows one mission of the report."""
-    return shlex.join(["moonteam", "rollout", "--from", source, "--mission", str(number),
-                       "--contender", contender])
 
 
 def summary_table(document: dict[str, Any]) -> str:
     """A row for each site and contender."""
     lines = []
+    best = best_means(document)
     for line in document["summary"]:
         found = [_spread(line, key, digits) for key, _, digits in COLUMNS]
         lines.append([f"{line['site']} {line['site_seed']}", Raw(
             f"<b>{html.escape(line['contender'])}</b>"),
-            f"{line['solved']} of {line['missions']}", *found, line["falls"], line["stuck"],
+            f"{line['solved']} of {line['missions']}", *found, line.get("planned"),
+            best.get((line["site"], line["site_seed"], line["contender"])), line["falls"],
+            line["stuck"],
             "; ".join(f"{cause.replace('_', ' ')} {count}" for cause, count
                       in line["replans_by_cause"].items()) or None])
-    return table(["site", "contender", "solved", *(title for _, title, _ in COLUMNS), "fell",
-                  "stuck", "causes of new plans"], lines)
+    return known(["site", "contender", "solved", *(title for _, title, _ in COLUMNS),
+                  "planned s", "optimum s", "fell", "stuck", "causes of new plans"], lines)
+
+
+def best_means(document: dict[str, Any]) -> dict[tuple[str, int, str], float]:
+    """By the clock: the optimum's seconds, in the mean of the missions that a contender of a site
+    solved; without those whose optimum is not known.
+    """
+    by_number: dict[int, list[Row]] = {}
+    for row in document["rows"]:
+        by_number.setdefault(row["number"], []).append(row)
+    best = {number: optimum(rows, "seconds") for number, rows in by_number.items()}
+    groups: dict[tuple[str, int, str], list[float]] = {}
+    for row in document["rows"]:
+        if row["report"]["success"] and (value := best[row["number"]]) is not None:
+            groups.setdefault((row["site"], row["site_seed"], row["contender"]), []).append(value)
+    return {key: sum(values) / len(values) for key, values in groups.items()}
 
 
 def intervals_plot(document: dict[str, Any]) -> str:
@@ -80,7 +93,8 @@ def intervals_plot(document: dict[str, Any]) -> str:
     names = [line["contender"] + (f", {line['site']} {line['site_seed']}" if many else "")
              for line in lines]
     panels = [(title, [mean_interval(line, key) for line in lines]) for key, title in FIGURES]
-    return plot(plots.intervals(names, panels), "means with intervals") if names else ""
+    panels = [panel for panel in panels if any(panel[1])]
+    return plot(plots.intervals(names, panels), "means with intervals") if panels else ""
 
 
 def comparisons_table(document: dict[str, Any]) -> str:
@@ -100,7 +114,7 @@ def causes_table(document: dict[str, Any], source: str) -> str:
     for group in document["failures"]:
         for cause, numbers in group["causes"].items():
             shown = ", ".join(
-                f'<span title="{html.escape(rollout_command(source, n, group["contender"]))}">'
+                f'<span title="{html.escape(rollout_command(source, group | {"number": n}))}">'
                 f"{n}</span>" for n in numbers)
             lines.append([f"{group['site']} {group['site_seed']}", group["contender"], cause,
                           len(numbers), Raw(shown)])
@@ -114,7 +128,7 @@ def failures_table(document: dict[str, Any], source: str) -> str:
     lines = []
     for row in failed[:MOST_FAILURES]:
         report = row["report"]
-        command = rollout_command(source, row["number"], row["contender"])
+        command = rollout_command(source, row)
         lines.append([
             row["number"], f"{row['site']} {row['site_seed']}", row["contender"],
             (report["cause"] or "").replace("_", " "), report["detail"], report["seconds"],
@@ -148,11 +162,11 @@ def _section(title: str, text: str) -> list[str]:
     return [f"<h2>{html.escape(title)}</h2>", text] if text else []
 
 
-def _spread(line: dict[str, Any], key: str, digits: int) -> Raw:
+def _spread(line: dict[str, Any], key: str, digits: int) -> Raw | None:
     """A figure, its interval small beside it."""
     value = mean_interval(line, key)
     if value is None:
-        return Raw(cell(None))
+        return None
     mean, low, high = value
     around = "" if low is None or high is None else (
         f' <span class="dim">[{low:.{digits}f}, {high:.{digits}f}]</span>')

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from moonteam.report.intervals import Bootstrap, wilson
+from moonteam.report.intervals import Bootstrap, share, wilson
 
 
 @pytest.mark.parametrize(("hits", "count", "low", "high"), [
@@ -26,6 +26,25 @@ def test_wilsons_interval_is_that_of_the_formula():
             half = 1.96 * math.sqrt(share * (1 - share) / count + more / (4 * count))
             ends = ((share + more / 2 + sign * half) / (1 + more) for sign in (-1, 1))
             assert wilson(hits, count) == pytest.approx(tuple(ends), abs=2e-5)
+
+
+def test_two_of_two_is_no_certain_thing():
+    assert share([True, True]) == pytest.approx((1.0, 0.3424, 1.0), abs=1e-4)
+    assert share([0, 0, 0]) == pytest.approx((0.0, 0.0, 0.5615), abs=1e-4)
+    assert share([1.0, math.nan]) == pytest.approx((1.0, *wilson(1, 1)))
+    assert all(math.isnan(v) for v in share([]))
+
+
+def test_a_share_of_single_ones_is_wilsons():
+    assert share([1, 0, 0, 1, 1]) == pytest.approx((0.6, *wilson(3, 5)))
+
+
+def test_hits_that_come_together_count_for_less():
+    spread, together = share([1] * 10, [10] * 10), share([10] + [0] * 9, [10] * 10)
+    assert spread.value == together.value == 0.1
+    assert spread == pytest.approx((0.1, *wilson(10, 100)))
+    # All ten in one of ten scenarios: as one hit of ten.
+    assert together == pytest.approx((0.1, *wilson(1, 10)))
 
 
 def test_bootstrap_interval_is_that_of_the_normal_mean():

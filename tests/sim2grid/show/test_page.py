@@ -10,7 +10,10 @@ from sim2grid.frame import Frame
 from sim2grid.measure.metrics import GridPlan, make_report
 from sim2grid.measure.story import Story
 from sim2grid.show import page, plots
-from sim2grid.study.evaluation_page import evaluation_page
+from sim2grid.show.picture import ROBOTS, Ground
+from sim2grid.study.evaluation_page import best_means, evaluation_page
+from sim2grid.study.mission_cards import optimum
+from tests.browser import needs_chromium, visit
 
 VOID = {"meta", "img", "br"}
 
@@ -98,6 +101,44 @@ def row(number, contender, success, seconds, cause=None):
                        else None, "cause": cause, "detail": "T1 & T2 not solved"}}
 
 
+MISSION = {"map": {"size": [8, 8], "cell_m": 1.0}, "name": "flat-0-17",
+           "site": {"preset": "flat"},
+           "robots": [{"name": "a", "kind": "drone", "skills": ["A"], "start": [0, 0]},
+                      {"name": "b<", "kind": "wheeled", "skills": ["B"], "start": [3, 0]}],
+           "targets": [{"at": [0, 5], "skills": ["A"]}, {"at": [7, 5], "skills": ["A", "B"],
+                                                         "type": "AND", "service": 5.0}]}
+
+
+@pytest.fixture
+def clocked(document):
+    """Two missions by the clock, one of them also by the exact planner."""
+    def report(planner, expected, seconds, solved):
+        robots = [{"name": n, "lost": None, "lost_s": None} for n in ("a", "b<")]
+        targets = [
+            {"name": "T1", "at": [0, 5], "skills": ["A"], "type": "OR", "solved": True,
+             "time_s": 8.0, "expected_s": 7.5, "robots": ["a"]},
+            {"name": "T2", "at": [7, 5], "skills": ["A", "B"], "type": "AND", "solved": solved,
+             "time_s": seconds if solved else None, "expected_s": expected,
+             "robots": ["a", "b<"] if solved else []}]
+        return {"success": solved, "seconds": seconds, "inflation": None, "decisions": 2,
+                "planner": planner, "objective": "makespan", "grid_plan": None,
+                "cause": None if solved else "max_seconds", "detail": "", "targets": targets,
+                "expected_s": expected, "robots": robots}
+
+    def line(number, contender, *told):
+        return {"number": number, "contender": contender, "site": "mare", "site_seed": 0,
+                "nominal_s": None, "report": report(*told)}
+
+    names = ("closed exact clock", "closed greedy clock")
+    return document | {
+        "contenders": [{"name": name, "loop": "closed"} for name in names],
+        "summary": [document["summary"][0] | {"contender": name} for name in names],
+        "missions": [{"number": 17, "mission": MISSION}, {"number": 18, "mission": MISSION}],
+        "rows": [line(17, names[0], "exact", 20.0, 22.0, True),
+                 line(17, names[1], "greedy", 30.0, 33.0, True),
+                 line(18, names[1], "greedy", 31.0, 40.0, False)]}
+
+
 @pytest.fixture
 def document():
     summary = {"site": "mare", "site_seed": 0, "contender": "closed exact barrier", "solved": 1,
@@ -130,6 +171,65 @@ def test_the_evaluations_page_names_every_failure_and_the_command_that_shows_it(
 def test_an_evaluation_without_failures_or_rows_is_still_a_page(document):
     document |= {"rows": [], "summary": [], "failures": [], "interrupted": True}
     assert "Interrupted" in Reader(evaluation_page(document)).text
+
+
+def test_every_mission_has_a_map_a_gantt_and_its_film_on_demand(clocked):
+    text = evaluation_page(clocked, "runs/x/report.json")
+    read = Reader(text)
+    assert text.count('class="map"') == text.count('aria-label="who did what when"') == 3
+    assert text.count('href="#ground0"') == 3, "one ground, drawn once"
+    assert read.text.count("--out runs/x/films/17-closed-exact-clock") == 1
+    assert "b&lt;" in text
+    assert "b<</text>" not in text
+    for mark in ("plan: 30.0 s", "optimum: 20.0 s", "planned 7.5 s", "T2 solved at 33.0 s"):
+        assert mark in read.text
+
+
+def test_the_optimum_stands_beside_the_plan_where_the_exact_planner_was_asked(clocked):
+    assert optimum([row for row in clocked["rows"] if row["number"] == 17], "seconds") == 20.0
+    assert optimum([row for row in clocked["rows"] if row["number"] == 18], "seconds") is None
+    means = best_means(clocked)
+    assert means == {("mare", 0, name): 20.0 for name in (
+        "closed exact clock", "closed greedy clock")}
+
+
+def test_in_steps_the_optimum_is_in_decisions():
+    row = {"report": {"planner": "exact", "objective": "makespan", "expected_s": None,
+                      "grid_plan": {"makespan": 12}}}
+    assert optimum([row], "decisions") == 12
+    row["report"]["objective"] = "total_moves"
+    assert optimum([row], "decisions") is None
+
+
+@needs_chromium
+@pytest.mark.parametrize("size", [(1280, 1600), (390, 1600)])
+def test_the_evaluations_page_needs_no_sideways_scroll(clocked, tmp_path, size):
+    seen = visit(evaluation_page(clocked, "runs/x/report.json"), tmp_path, """
+        found.wide = [...document.querySelectorAll('.wide, pre')].filter(
+          one => one.scrollWidth > one.clientWidth + 1).length;""", size=size, budget_ms=1500)
+    assert seen.complaints == []
+    assert seen.fits
+    assert seen.found["width"] == size[0]
+    assert seen.found["wide"] == 0
+    assert seen.picture.stat().st_size > 20_000
+
+
+def test_robots_keep_their_colours_to_themselves():
+    assert not set(plots.SERIES) & set(ROBOTS)
+
+
+def test_paths_have_axes_a_scale_starts_and_plans(done, tmp_path):
+    _, story = done
+    figure = plots.paths(story, Ground(np.zeros((17, 17)), 0.25), np.eye(4, dtype=bool))
+    axis = figure.axes[0]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("east, m", "north, m")
+    assert axis.get_xlim() == (-2.0, 2.0)
+    said = {text.get_text() for text in axis.texts}
+    assert {"0.5 m", "T1 A", "T2 B"} <= said
+    legend = [text.get_text() for text in axis.get_legend().get_texts()]
+    assert legend == ["a", "b", "planned", "driven", "start"]
+    plots.save_png(figure, tmp_path / "paths.png")
+    assert (tmp_path / "paths.png").stat().st_size > 5_000
 
 
 def test_plots_are_the_same_for_the_same_data():
