@@ -26,6 +26,56 @@ def test_unknown_commands_say_what_there_is(words, capsys):
     assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize("group", ["evaluate", "bench", "check"])
+def test_a_group_lists_its_commands(group, capsys):
+    for word in cli.HELP:
+        assert cli.main([group, word]) == 0
+        shown = capsys.readouterr().out
+        listed = [name for name in cli.COMMANDS if f"  {name} " in shown]
+        assert listed == cli.members(group) != []
+
+
+@pytest.mark.parametrize(("words", "line"), [
+    ("trian quick", "moonteam trian: no such command; did you mean train? one of: train,"),
+    ("evaluate exection", "did you mean evaluate execution? one of: evaluate grid,"),
+    ("testsets imprt", "moonteam testsets: 'imprt' has no place here; see"),
+    ("site --presett mare", "--presett: moonteam site has no such option; did you mean --preset?"),
+    ("site --presett=mare", "did you mean --preset? see moonteam site --help"),
+    ("site --preset mar", "--preset: 'mar' is not one of mare, highland, crater_rim, polar, flat; "
+                          "did you mean mare?"),
+    ("site --size wide", "--size: {None}|FLOAT is needed: "),
+    ("site --seed", "--seed: a value must follow: INT"),
+    ("site mare", "moonteam site: 'mare' has no place here; see moonteam site --help"),
+    ("testsets --sets 3x5", "moonteam testsets: --out PATH must be given; see"),
+    ("testsets --out x --sets 3x55", "--sets: '3x55' is not one of "),
+    ("train imitate quik", "PRESET: 'quik' is not one of quick, any_team; did you mean quick?"),
+    ("train quick --familes.0.advantages critic", "did you mean --families.0.advantages?"),
+    ("train quick --families.0.advantages critc", "did you mean critic?"),
+    ("train qick", "qick: no such preset; did you mean quick? one of: quick,"),
+    ("bench train qick", "qick: no such preset; did you mean quick? one of: quick,"),
+    ("rollout outpst", "did you mean outpost? bundled missions: demo,"),
+    ("plan 3x55", "did you mean 3x5? bundled missions: demo,"),
+    ("plan 3x55:0", "did you mean 3x5? bundled testsets: 2x3,"),
+    ("plan outpst", "did you mean outpost? bundled missions: demo,"),
+    ("plan demo --planner exat", "did you mean exact?"),
+    ("rollout demo --decode argmx", "did you mean argmax?"),
+    ("rollout demo --decode best-of16", "did you mean best-of-K?"),
+    ("rollout demo --policy any_tem", "did you mean any_team?"),
+    ("site --travel weeled", "did you mean wheeled?"),
+    ("check robot weeled", "did you mean wheeled?"),
+    ("check planner exat", "did you mean exact?"),
+    ("evaluate grid 3x55", "did you mean 3x5?"),
+    ("export any_tem --out x.onnx", "did you mean any_team?"),
+    ("evaluate execution --site mar", "did you mean mare?")])
+def test_a_name_that_is_nearly_right_is_said(words, line, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words.split()) == 2
+    err = capsys.readouterr().err
+    assert line in err
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_every_command_has_help_with_examples(name, capsys):
     module = importlib.import_module(cli.COMMANDS[name][0])
@@ -75,7 +125,7 @@ def test_a_folder_does_not_stand_before_a_bundled_name(tmp_path, monkeypatch):
     assert loading.load("demo").name == "demo"
     assert len(loading.load("3x5")) == 1000
     assert loading.load("3x5:2").id == loading.load("3x5")[2].id
-    with pytest.raises(InputError, match=r"^mine: is a folder, and not one of"):
+    with pytest.raises(InputError, match=r"^mine: is a folder; "):
         loading.load("mine")
     (tmp_path / "demo").rmdir()
     (tmp_path / "demo").write_text("{}")

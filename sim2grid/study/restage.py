@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from moonteam import files
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.problem import mission as missions
 from sim2grid.clock.execution import TimedExecution
 from sim2grid.clock.prepare import by_the_clock, execution_of
@@ -90,10 +90,10 @@ def restage(report: dict[str, Any], number: int, source: object,
 def _contender(report: dict[str, Any], name: str | None, source: object) -> Contender:
     """The contender of that name, else the first that is in physics."""
     physical = {c["name"]: c for c in report["contenders"] if c["loop"] != "grid"}
-    if name is None:
-        name = next(iter(physical), "")
-    if name not in physical:
-        raise InputError(source, f"has no contender {name!r} in physics; it has "
-                         + (", ".join(physical) or "none"), "--contender")
-    known = {key: value for key, value in physical[name].items() if key != "name"}
+    wanted = next(iter(physical), "") if name is None else name
+    if wanted not in physical:
+        raise InputError(source, f"has no contender {wanted!r} in physics; "
+                         f"{meant(wanted, physical)}it has " + (", ".join(physical) or "none"),
+                         "--contender")
+    known = {key: value for key, value in physical[wanted].items() if key != "name"}
     return msgspec.convert(known, Contender)

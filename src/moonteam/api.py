@@ -6,7 +6,6 @@ same name does, with the same options under the same names.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from moonteam import files, interrupts, loading, outputs
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.loading import load
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
@@ -209,9 +208,7 @@ def _built(kind: type[T], call: str, options: dict[str, Any]) -> T:
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     for key in options:
         if key not in known:
-            near = difflib.get_close_matches(key, known, 1)
-            meant = f"did you mean {near[0]}? " if near else ""
-            raise InputError(f"{call}({key}=)", f"no such option; {meant}allowed: "
+            raise InputError(f"{call}({key}=)", f"no such option; {meant(key, known)}allowed: "
                              + ", ".join(known))
     return kind(**options)
 

@@ -19,7 +19,7 @@ import sys
 from typing import Any
 
 from moonteam import compilation, interrupts
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant, not_one_of
 from moonteam.version import __version__
 
 COMMANDS = {
@@ -67,12 +67,22 @@ COMMANDS = {
 }
 
 
-def usage() -> str:
-    """The overview that `moonteam --help` prints."""
+HELP = ("-h", "--help", "help")
+
+
+def usage(group: str = "") -> str:
+    """The overview that `moonteam --help` prints, or `moonteam GROUP --help`."""
+    head = " ".join(["moonteam", *filter(None, [group])])
     lines = [f"moonteam {__version__}: plan for a team of unlike robots on the Moon, "
-             "and prove the plan in physics.", "", "usage: moonteam COMMAND [options]", ""]
-    lines += [f"  {name:<20} {line}" for name, (_, line) in COMMANDS.items()]
-    return "\n".join([*lines, "", "moonteam COMMAND --help shows options and examples."])
+             "and prove the plan in physics.", "", f"usage: {head} COMMAND [options]", ""]
+    lines += [f"  {name:<20} {line}" for name, (_, line) in COMMANDS.items()
+              if not group or name in members(group)]
+    return "\n".join([*lines, "", f"{head} COMMAND --help shows options and examples."])
+
+
+def members(group: str) -> list[str]:
+    """The commands whose first word of two it is."""
+    return [name for name in COMMANDS if name.startswith(group + " ")]
 
 
 def find_command(words: list[str]) -> tuple[str, list[str]]:
@@ -81,9 +91,13 @@ def find_command(words: list[str]) -> tuple[str, list[str]]:
         name = " ".join(words[:count])
         if len(words) >= count and name in COMMANDS:
             return name, words[count:]
-    group = [name for name in COMMANDS if name.startswith(words[0] + " ")]
-    raise InputError("moonteam " + words[0], "no such command; one of: "
-                     + ", ".join(group or COMMANDS))
+    first, second = [*words[:2], ""][:2]
+    if group := members(first):
+        near = meant(second, [name.split()[1] for name in group], f"{first} ")
+    else:
+        near = meant(first, [name.split()[0] for name in COMMANDS])
+    raise InputError(" ".join(["moonteam", *words[:1 + bool(group)]]),
+                     f"no such command; {near}one of: " + ", ".join(group or COMMANDS))
 
 
 def parse(name: str, words: list[str]) -> Any:
@@ -176,7 +190,7 @@ def _surroundings() -> str | None:
     """One line of what in the environment lets nothing run; None where all is well with it."""
     renderer, platforms = os.environ.get("MUJOCO_GL", ""), os.environ.get("JAX_PLATFORMS", "")
     if renderer and "mujoco" not in sys.modules and renderer.lower() not in RENDERERS:
-        return f"MUJOCO_GL: {renderer!r} is not allowed; one of: {', '.join(RENDERERS)}"
+        return f"MUJOCO_GL: {not_one_of(renderer, RENDERERS)}"
     if platforms and "jax" in sys.modules and not compilation.devices():
         return (f"JAX_PLATFORMS: there is no device of {platforms!r} here; unset it, or set it to "
                 "cpu")
@@ -188,9 +202,12 @@ def _run(words: list[str]) -> int:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     # With 64 bits JAX draws other numbers, and the same seed would give other results.
     os.environ["JAX_ENABLE_X64"] = "0"
-    if not words or words[0] in ("-h", "--help", "help"):
+    if not words or words[0] in HELP:
         print(usage())
         return 0 if words else 2
+    if members(words[0]) and words[0] not in COMMANDS and words[1:2] and words[1] in HELP:
+        print(usage(words[0]))
+        return 0
     if words[0] == "--version":
         print(__version__)
         return 0

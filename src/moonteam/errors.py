@@ -1,8 +1,33 @@
 """Errors that a user can mend: one clear line naming file, key and what is allowed."""
 
+import difflib
+from collections.abc import Iterable
 
 LONGEST = 600
 """Characters of a source or a problem that are shown."""
+_LONGEST_NAME = 80
+"""Characters of a name that is compared with others."""
+_NEAR = 0.65
+"""Of two names that are taken for one: twice what they share over the letters of both."""
+
+
+def meant(name: str, names: Iterable[str], before: str = "") -> str:
+    """`did you mean NEAR? `, to be put before the list of names; empty where none is near.
+
+    `before` is what all of them begin with, to be said but not compared.
+    """
+    if len(name) > _LONGEST_NAME:
+        return ""
+    known = {one.casefold(): one for one in names}
+    near = difflib.get_close_matches(name.casefold(), known, 1, _NEAR)
+    return f"did you mean {before}{known[near[0]]}? " if near else ""
+
+
+def not_one_of(name: object, names: Iterable[object]) -> str:
+    """What is said of a value that is none of a few, the nearest of them at the end."""
+    known = [str(one) for one in names]
+    near = meant(str(name), known).rstrip()
+    return f"{name!r} is not one of {', '.join(known)}{'; ' * bool(near)}{near}"
 
 
 class InputError(Exception):

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from moonteam import outputs
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.strict import json_value
 
 T = TypeVar("T")
@@ -60,12 +60,18 @@ def convert(value: Any, kind: type[T], source: object, where: str = "") -> T:
         if problem.startswith("Object contains unknown field"):
             allowed = _fields_at(kind, key.removeprefix(where).lstrip("."))
             problem = problem.replace("Object contains unknown field", "unknown key")
-            problem += f"; allowed: {', '.join(allowed)}" if allowed else ""
+            problem += _instead(problem, allowed)
         elif problem.startswith("Invalid enum value"):
             allowed = _choices_at(kind, key.removeprefix(where).lstrip("."))
             problem = problem.replace("Invalid enum value", "unknown value")
-            problem += f"; allowed: {', '.join(allowed)}" if allowed else ""
+            problem += _instead(problem, allowed)
         raise InputError(source, problem.replace("Object missing", "missing"), key) from None
+
+
+def _instead(problem: str, allowed: list[str]) -> str:
+    """What might have been meant in place of the word that a problem ends with, and may be."""
+    word = problem.partition(" ")[2].partition(" ")[2].strip("`'")
+    return f"; {meant(word, allowed)}allowed: {', '.join(allowed)}" if allowed else ""
 
 
 def _fields_at(kind: Any, path: str) -> list[str]:

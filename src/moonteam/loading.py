@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from moonteam import paths
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.problem import mission as missions
 from moonteam.problem import scenario, timed
 from moonteam.problem.mission import Mission
@@ -16,6 +16,7 @@ from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
 
 YAML = (".yaml", ".yml")
+SETS, MISSIONS = ("testsets", ".jsonl"), ("missions", ".yaml")
 
 
 def load(source: str | os.PathLike[str]
@@ -35,8 +36,13 @@ def load(source: str | os.PathLike[str]
     if path.suffix == ".jsonl":
         return load_set(path)
     if path.suffix in YAML or (not path.suffix and not path.is_file()):
-        if (paths.assets() / "testsets" / f"{name}.jsonl").is_file():
-            return load_set(paths.find(name, "testsets", ".jsonl"))
+        sets, known = (paths.bundled_names(*kind) for kind in (SETS, MISSIONS))
+        if name in sets and not path.suffix:
+            return load_set(paths.find(name, *SETS))
+        if not path.is_file() and not path.suffix and name not in known:
+            what = "is a folder" if path.is_dir() else "no such file"
+            raise InputError(name, f"{what}; {meant(name, [*known, *sets])}bundled "
+                             f"missions: {', '.join(known)}; sets: {', '.join(sets)}")
         return load_mission(name)
     return timed.load(path) if timed.by_the_clock(path) else scenario.load(path)
 
@@ -105,5 +111,6 @@ def pick(path: Path, which: str) -> Scenario | Timed:
         return same[0]
     if which.isdecimal() and int(which) < len(found):
         return found[int(which)]
-    raise InputError(path, f"has no scenario {which!r}; a number 0 to {len(found) - 1} or an id, "
-                     f"such as {found[0].id or 'none here'}")
+    near = meant(which, [s.id for s in found])
+    raise InputError(path, f"has no scenario {which!r}; {near}a number 0 to {len(found) - 1} or an "
+                     f"id, such as {found[0].id or 'none here'}")

@@ -1,9 +1,8 @@
 """Where the bundled assets are: inside the wheel, else in the checkout."""
 
-import difflib
 from pathlib import Path
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 
 
 def assets() -> Path:
@@ -28,8 +27,12 @@ def find(name: str, folder: str, suffix: str) -> Path:
     bundled = assets() / folder / (name if name.endswith(suffix) else name + suffix)
     if bundled.is_file():
         return bundled
-    names = sorted(p.stem for p in (assets() / folder).glob(f"*{suffix}"))
-    near = difflib.get_close_matches(path.stem, names, 1)
-    meant = f"; did you mean {near[0]}?" if near else ""
-    what = "is a folder, and not" if path.is_dir() else "no such file, nor"
-    raise InputError(name, f"{what} one of the bundled {folder}: {', '.join(names)}{meant}")
+    names = bundled_names(folder, suffix)
+    what = "is a folder" if path.is_dir() else "no such file"
+    raise InputError(name, f"{what}; {meant(path.stem, names)}bundled {folder}: "
+                     + ", ".join(names))
+
+
+def bundled_names(folder: str, suffix: str) -> list[str]:
+    """Of the bundled assets of one kind, by which `find` knows them."""
+    return sorted(p.stem for p in (assets() / folder).glob(f"*{suffix}"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import sys
@@ -12,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Generic, TypeVar, cast
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 
 T = TypeVar("T")
 
@@ -85,10 +84,8 @@ class Registry(Generic[T]):
         return cast(T, thing)
 
     def _unknown(self, name: str) -> str:
-        near = difflib.get_close_matches(name, self.names(), 1)
-        meant = f"did you mean {near[0]}? " if near else ""
-        return (f"no such {self.noun}; {meant}registered: {', '.join(self.names())}; or "
-                "FILE.py:OBJECT")
+        return (f"no such {self.noun}; {meant(name, self.names())}registered: "
+                f"{', '.join(self.names())}; or FILE.py:OBJECT")
 
 
 def _from_file(file: str, thing: str) -> object:
@@ -98,10 +95,8 @@ def _from_file(file: str, thing: str) -> object:
         raise InputError(file, "no such file")
     module = _module(path.resolve())
     if not hasattr(module, thing):
-        offered = [name for name in vars(module) if not name.startswith("_")]
-        near = difflib.get_close_matches(thing, offered, 1)
-        meant = f"; did you mean {near[0]}?" if near else ""
-        raise InputError(file, f"holds no {thing!r}{meant}")
+        near = meant(thing, [name for name in vars(module) if not name.startswith("_")])
+        raise InputError(file, f"holds no {thing!r}{'; ' * bool(near)}{near}")
     return getattr(module, thing)
 
 

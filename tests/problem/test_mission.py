@@ -44,7 +44,8 @@ def test_a_mission_becomes_a_scenario(tmp_path):
 
 
 BAD = {
-    "unknown key": ("cell_m: 1.5", "cell: 1.5", "map: unknown key `cell`; allowed: size, cell_m"),
+    "unknown key": ("cell_m: 1.5", "cell: 1.5",
+                    "map: unknown key `cell`; did you mean cell_m? allowed: size, "),
     "unknown key in a list": ("start: [0, 5]", "start: [0, 5], legs: 4",
                               "robots[0]: unknown key `legs`"),
     "wrong type": ("size: [8, 6]", "size: [8, six]", "map.size[1]: Expected `int`, got `str`"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from training.bench.measure import Wanted, matmul_peak, peak_bytes, timed
 
 if TYPE_CHECKING:
@@ -33,11 +33,11 @@ def measure(args: Wanted, command: str) -> dict[str, Any]:
     from training.bench import account
     from training.mappo import config, networks, rollout, update
     from training.mappo.grid_task import GridTask
+    from training.mappo.macro.config import PRESETS as MACRO
 
-    chosen = config.preset(args.preset)
+    chosen = config.preset(args.preset, tuple(MACRO))
     if args.phase not in dict(chosen.phases):
-        raise InputError("phase", f"{args.phase!r} is not one of "
-                         + ", ".join(name for name, _ in chosen.phases))
+        raise InputError("phase", not_one_of(args.phase, dict(chosen.phases)))
     given = {"num_envs": args.num_envs, "num_minibatches": args.num_minibatches}
     phase = dataclasses.replace(getattr(chosen, args.phase),
                                 **{k: v for k, v in given.items() if v is not None})

@@ -6,11 +6,11 @@ stated there. Checked when built: an impossible division never reaches the first
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.grid import rewards
 from moonteam.grid.config import EnvConfig, RewardWeights
 from moonteam.policies.recurrent import RecurrentSpec
@@ -197,8 +197,14 @@ PRESETS = {
 """`pi_5t5r` takes the five-target figures: the paper lists none of its own."""
 
 
-def preset(name: str, others: Sequence[str] = ()) -> Config:
-    """The preset of that name. Raises InputError listing the names, those of `others` too."""
+def preset(name: str, others: Sequence[str] = (), words: Iterable[str] = ()) -> Config:
+    """The preset of that name.
+
+    Raises InputError listing the names, those of `others` too; `words` may have been meant as well.
+    """
     if name not in PRESETS:
-        raise InputError(name, f"no such preset; one of: {', '.join([*others, *PRESETS])}")
+        names = [*others, *PRESETS]
+        near = meant(name, [*names, *words])
+        raise InputError(name or "moonteam train", ("no such preset; " if name else
+                         "a preset must be given; ") + f"{near}one of: {', '.join(names)}")
     return PRESETS[name]

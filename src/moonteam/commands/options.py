@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import tyro
 
 from moonteam import outputs
+from moonteam.commands import refused
 from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
@@ -35,14 +36,20 @@ def parse(kind: type[T], name: str, words: Sequence[str], default: T | None = No
     """The words after `moonteam NAME`, read into a command's `Args`.
 
     With a `default`, whose values then are the options' own, each flag has its opposite too.
+    Raises InputError for words that it does not take, SystemExit for --help.
     """
     # PYTHONOPTIMIZE=2 leaves docstrings out, and dataclasses put something else in their place.
     about = _docstring(kind) if sys.flags.optimize > 1 else inspect.getdoc(kind)
     prog = f"moonteam {name}"
-    if default is not None:
-        return tyro.cli(kind, prog=prog, args=words, default=default, description=about)
-    return tyro.cli(kind, prog=prog, args=words, description=about,
-                    config=(tyro.conf.FlagCreatePairsOff,))
+
+    def read(words: Sequence[str]) -> T:
+        if default is not None:
+            return tyro.cli(kind, prog=prog, args=words, default=default, description=about)
+        return tyro.cli(kind, prog=prog, args=words, description=about,
+                        config=(tyro.conf.FlagCreatePairsOff,))
+
+    with refused.in_one_line(prog, lambda: read(["--help"])):
+        return read(words)
 
 
 def _docstring(kind: type) -> str | None:

@@ -12,7 +12,7 @@ import tyro
 
 from moonteam import compilation, files
 from moonteam.commands.options import Printed, Saved
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.problem import scenario
 from moonteam.problem.scenario import ACTIONS, Scenario
 from moonteam.strict import json_value
@@ -62,9 +62,12 @@ def choose(path: Path, name: str) -> Scenario:
     """The scenario of a file, or the named one of a set. Raises InputError."""
     found = scenario.load_set(path) if path.suffix == ".jsonl" else [scenario.load(path)]
     if name:
-        found = [s for s in found if s.id == name]
-        if not found:
-            raise InputError(path, f"holds no scenario with the id {name!r}")
+        same = [s for s in found if s.id == name]
+        if not same:
+            near = meant(name, [s.id for s in found]).rstrip()
+            near = near and f"; {near}"
+            raise InputError(path, f"holds no scenario with the id {name!r}{near}")
+        found = same
     if len(found) > 1:
         raise InputError(path, f"holds {len(found)} scenarios; choose one with --id")
     return found[0]
@@ -97,7 +100,8 @@ def _number(action: Any, label: str, key: str) -> int:
         return ACTIONS.index(action)
     if isinstance(action, int) and not isinstance(action, bool) and 0 <= action < len(ACTIONS):
         return action
-    raise InputError(label, f"{json.dumps(action)} is no action; one of {', '.join(ACTIONS)} "
+    near = meant(action, ACTIONS) if isinstance(action, str) else ""
+    raise InputError(label, f"{json.dumps(action)} is no action; {near}one of {', '.join(ACTIONS)} "
                      f"or 0 to {len(ACTIONS) - 1}", key)
 
 

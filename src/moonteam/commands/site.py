@@ -73,6 +73,10 @@ def run(args: Args) -> int:
         raise InputError("--cell", f"{args.cell:g} is not allowed; 0.25 to 100 metres")
     from moonteam.terrain.measure import measure
 
+    if args.travel is not None:
+        from moonteam.robots import KINDS
+
+        KINDS.get(args.travel)  # before anything is made
     site = _site(args)
     seconds = _seconds(site, args.cell)
     report = measure(site) | _summary(seconds)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from moonteam import files, outputs
 from moonteam.commands import testsets_seconds
 from moonteam.commands.options import Forced, Printed
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from moonteam.problem import timed
 from moonteam.problem.scenario import Optimal, Scenario, save_set
 from moonteam.report import progress
@@ -159,7 +159,7 @@ def run(args: Args) -> int:
     """Makes the sets asked for; returns 0."""
     unknown = [name for name in args.sets if name not in ALL]
     if unknown:
-        raise InputError("--sets", f"{unknown[0]!r} is not allowed; " + ", ".join(ALL))
+        raise InputError("--sets", not_one_of(unknown[0], ALL))
     slow = [speed for speed in args.speeds if not 0 < speed < math.inf]
     if slow or not args.speeds:
         raise InputError("--speeds", f"{slow or 'nothing'} is not allowed; m/s above 0")

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from moonteam.problem.scenario import MAX_SKILLS
 
 Phase = Literal["bootstrap", "refinement"]
@@ -29,7 +29,7 @@ class RewardWeights:
     def phase(self, phase: Phase) -> RewardWeights:
         """The weights active in a training phase: bootstrap has AR, TR and WC alone."""
         if phase not in PHASES:
-            raise InputError("phase", f"{phase!r} is not one of {', '.join(PHASES)}")
+            raise InputError("phase", not_one_of(phase, PHASES))
         return replace(self, SC=0.0, TC=0.0, TB=0.0) if phase == "bootstrap" else self
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 import jax.numpy as jnp
 from jax import Array
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from moonteam.grid.config import EnvConfig, Phase, RewardWeights
 from moonteam.grid.types import Problem, Rewards, State
 
@@ -44,7 +44,7 @@ PRESETS = {
 def preset(name: str) -> RewardPreset:
     """A preset by name. Raises InputError naming those there are."""
     if name not in PRESETS:
-        raise InputError("preset", f"{name!r} is not one of {', '.join(PRESETS)}")
+        raise InputError("preset", not_one_of(name, PRESETS))
     return PRESETS[name]
 
 

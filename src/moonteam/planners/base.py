@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from moonteam.problem import rules
 from moonteam.problem.scenario import ACTIONS, Scenario
 
@@ -29,7 +29,7 @@ def check_objective(objective: str, alpha: float, beta: float) -> Objective:
     """The objective, if it is one and its weights make sense. Raises InputError."""
     known: dict[str, Objective] = {name: name for name in OBJECTIVES}
     if objective not in known:
-        raise InputError("--objective", f"{objective!r} is not one of {', '.join(OBJECTIVES)}")
+        raise InputError("--objective", not_one_of(objective, OBJECTIVES))
     if objective == "weighted" and not (
             alpha >= 0 and beta >= 0 and 0 < alpha + beta < math.inf):
         raise InputError("--objective weighted", f"alpha {alpha} and beta {beta} are not allowed; "

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.planners.base import SAMPLING
 
 MOST_ROLLOUTS = 4096
 ALLOWED = ("argmax, plain-argmax, sample or best-of-K (such as best-of-16); @T after it "
            "sets the temperature of drawing (such as sample@0.25)")
+MODES = ("argmax", "plain-argmax", "sample", "best-of-K")
 
 _FORM = re.compile(r"(?P<how>argmax|plain-argmax|sample|best-of-(?P<count>[^@]*))(@(?P<heat>.*))?")
 
@@ -53,7 +54,8 @@ def parse(text: str) -> Decode:
     """The decoding that a user names, see `ALLOWED`. Raises InputError."""
     found = _FORM.fullmatch(text)
     if found is None:
-        raise InputError("--decode", f"{text!r} is not one of {ALLOWED}")
+        near = meant(re.sub(r"of-?\d*$", "of-K", text.partition("@")[0]), MODES).rstrip()
+        raise InputError("--decode", f"{text!r} is not one of {ALLOWED}{'; ' * bool(near)}{near}")
     how, count = found["how"], found["count"]
     rollouts = 1
     if count is not None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import msgspec
 
 from moonteam import paths
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from moonteam.policies import entity, pointer, policy_file, recurrent
 from moonteam.policies.brain import Brain, EntityBrain, Mission, PointerBrain, RecurrentBrain
 from moonteam.policies.entity import EntitySpec
@@ -41,8 +41,7 @@ class Policy:
                                  "entity": (EntitySpec, EntityBrain, entity.init),
                                  "pointer": (PointerSpec, PointerBrain, pointer.init)}
         if stored.kind not in kinds:
-            raise InputError(path, f"network kind {stored.kind!r} is not one of "
-                             + ", ".join(kinds))
+            raise InputError(path, "network kind " + not_one_of(stored.kind, kinds))
         spec_type, brain_type, init = kinds[stored.kind]
         try:
             spec = msgspec.convert(stored.config, spec_type)

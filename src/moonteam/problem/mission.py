@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from moonteam import files
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.problem import scenario, timed
 from moonteam.problem.piece import Piece, Units
 from moonteam.problem.scenario import MOST_AGENTS, MOST_STEPS, MOST_TARGETS, Cell, Name, Skills
@@ -265,7 +265,8 @@ def _check_clock(mission: Mission, source: object) -> None:
         for name in target.after:
             if name not in numbers or name == names[j]:
                 others = ", ".join(other for other in names if other != names[j])
-                raise fail("after", f"{name!r} is not allowed; other targets: {others}")
+                raise fail("after", f"{name!r} is not allowed; {meant(name, names)}other targets: "
+                           + others)
         after.append(tuple(numbers[name] for name in target.after))
         timed.check_times(target, fail)
         timed.check_coalition(target, team, fail)
@@ -298,9 +299,10 @@ def _check_skills(mission: Mission, targets: tuple[Target, ...], source: object,
     """Raises InputError if the team can never solve one of them; `key` has a place for which."""
     asked = msgspec.structs.replace(mission, targets=targets).scenario()
     for j, skills in scenario.missing_skills(asked).items():
-        raise InputError(source, f"no robot has skill {', '.join(skills) or '?'}; the team has "
-                         + ", ".join(sorted({s for r in mission.robots for s in r.skills})),
-                         key.format(j))
+        have = sorted({s for r in mission.robots for s in r.skills})
+        near = meant(skills[0], have) if len(skills) == 1 else ""
+        raise InputError(source, f"no robot has skill {', '.join(skills) or '?'}; {near}the team "
+                         f"has {', '.join(have)}", key.format(j))
 
 
 def _as_mission_keys(mission: Mission, source: object) -> None:
@@ -401,7 +403,8 @@ def _check_when(mission: Mission, event: Event, source: object, key: str) -> Non
 def _check_robot(mission: Mission, name: str, source: object, key: str) -> None:
     names = [robot.name for robot in mission.robots]
     if name not in names:
-        raise InputError(source, f"no robot is named {name!r}; robots: {', '.join(names)}", key)
+        raise InputError(source, f"no robot is named {name!r}; {meant(name, names)}robots: "
+                         + ", ".join(names), key)
 
 
 def _check_cell(mission: Mission, cell: Cell, source: object, key: str) -> None:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.problem.mission import Mission
 from moonteam.problem.piece import WHOLE, Piece
 from moonteam.terrain import dem, generate
@@ -38,6 +38,9 @@ how far it strays.
 
 MAX_SAMPLES = 1_500_000
 """Largest number of elevation samples in a site."""
+
+SITES = (*generate.PRESETS, "flat")
+"""Presets of ground."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +113,8 @@ def make_site(
     if preset == "flat":
         return Site("flat", seed, np.zeros(shape, np.float32), spacing, meta={"preset": "flat"})
     if preset not in generate.PRESETS:
-        raise InputError("site", f"no preset {preset!r}; presets: "
-                         + ", ".join([*generate.PRESETS, "flat"]), "preset")
+        raise InputError("site", f"no preset {preset!r}; {meant(preset, SITES)}presets: "
+                         + ", ".join(SITES), "preset")
     heights, craters, rocks = generate.evaluate(preset, seed, shape, spacing)
     site = Site(preset, seed, heights, spacing)
     meta = {

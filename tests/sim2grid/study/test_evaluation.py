@@ -242,7 +242,7 @@ CLOCKED = "tests/evaluation/nearest.py"
     (["--mission", "demo", "demo"], "--mission: give each once"),
     (["--mission", "demo", "--count", "3"], "--count: is for random missions"),
     (["--mission", "demo", "--team", "drone"], "--team: is for random missions"),
-    (["--mission", "outpots"], "outpots: no such file, nor one of the bundled missions"),
+    (["--mission", "outpots"], "outpots: no such file; did you mean outpost"),
     (["--mission", "demo", "sampling"], "sampling: clock: is by the clock, which --mode clock"),
     (["--dem", "none.tif"], "none.tif: no such file"),
     (["--dem", "examples/ground/rim.tif", "--centre", "30", "0"],

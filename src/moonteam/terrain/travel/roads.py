@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, meant
 from moonteam.problem.mission import Mission
 from moonteam.problem.rules import centre
 from moonteam.terrain.site import Site
@@ -197,8 +197,8 @@ class Roads:
 
     def _of(self, kind: str) -> Fields:
         if kind not in self.kinds:
-            raise InputError("kind", f"no roads for {kind!r}; there are for "
-                             + ", ".join(self.kinds))
+            raise InputError("kind", f"no roads for {kind!r}; {meant(kind, self.kinds)}there are "
+                             "for " + ", ".join(self.kinds))
         return self.kinds[kind]
 
     def _placed(self, xy: Points) -> Floats:

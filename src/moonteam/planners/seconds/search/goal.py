@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from moonteam.errors import InputError
+from moonteam.errors import InputError, not_one_of
 from moonteam.planners.base import check_objective
 from moonteam.planners.seconds.base import Int64, Moment, Service, TimedPlan, effort, makespan
 from moonteam.planners.seconds.search.work import Open
@@ -27,7 +27,7 @@ def check(objective: str, alpha: float, beta: float) -> Objective:
     known: dict[str, Objective] = {"makespan": "makespan", "effort": "effort",
                                    "weighted": "weighted"}
     if objective not in known:
-        raise InputError("--objective", f"{objective!r} is not one of {', '.join(known)}")
+        raise InputError("--objective", not_one_of(objective, known))
     if objective == "weighted":
         check_objective(objective, alpha, beta)
     return known[objective]
