@@ -6,6 +6,8 @@ import contextlib
 import ctypes
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,79 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+class Spent:
+    """Seconds covered by pieces of work that may overlap, each told of as it ends."""
+
+    def __init__(self, now: Callable[[], float] = time.perf_counter):
+        self.seconds = 0.0
+        self._now = now
+        self._pieces: list[tuple[float, float]] = []  # apart from each other, in order
+        self._lock = threading.Lock()
+
+    def add(self, seconds: float) -> None:
+        """A piece that took so long ends now."""
+        with self._lock:
+            end = self._now()
+            begin = end - seconds
+            while self._pieces and self._pieces[-1][1] >= begin:
+                first, last = self._pieces.pop()
+                begin = min(begin, first)
+                self.seconds -= last - first
+            self._pieces.append((begin, end))
+            self.seconds += end - begin
+
+
+_compiling = Spent()
+_heard: set[str] = set()
+
+
+def spent_compiling() -> float:
+    """Seconds in which this process traced or compiled for JAX or Numba, since it was first asked.
+
+    What several threads compile at once counts once; what is under way counts at its end.
+    """
+    _hear()
+    return _compiling.seconds
+
+
+def working_time() -> float:
+    """Seconds of a clock that stands still while something is compiled."""
+    spent = spent_compiling()
+    return time.perf_counter() - spent
+
+
+def _hear() -> None:
+    """Listens to what is imported by now."""
+    if "jax" in sys.modules and "jax" not in _heard:
+        import jax
+
+        _heard.add("jax")
+        jax.monitoring.register_event_duration_secs_listener(_of_jax)
+    if "numba" in sys.modules and "numba" not in _heard:
+        from numba.core import event
+
+        class OfNumba(event.Listener):
+            """Numba tells of the beginning of each compilation, and of its end."""
+
+            begun = threading.local()
+
+            def on_start(self, event: Any) -> None:
+                vars(self.begun).setdefault("times", []).append(time.perf_counter())
+
+            def on_end(self, event: Any) -> None:
+                times = vars(self.begun).get("times")
+                if times:
+                    _compiling.add(time.perf_counter() - times.pop())
+
+        _heard.add("numba")
+        event.register("numba:compile", OfNumba())
+
+
+def _of_jax(event: str, seconds: float, **_: Any) -> None:
+    if event.startswith("/jax/core/compile/"):
+        _compiling.add(seconds)
 
 
 def keep_freed_memory() -> None:
@@ -60,6 +135,7 @@ def enable_cache() -> None:
     import jax
 
     keep_freed_memory()
+    _hear()
     folder = cache_folder() / "jax"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -99,6 +175,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Numba's decorator, without its cache where that has nowhere to be, or no room."""
     import numba
 
+    _hear()
     jit: Any = numba.njit
 
     def decorate(function: Callable[..., Any]) -> Any:

@@ -1,4 +1,7 @@
-"""A progress bar on standard error, when somebody watches it."""
+"""A progress bar on standard error, when somebody watches it.
+
+Time left is by what was done since the bar began, compiling left out.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
+
+from moonteam import compilation
 
 T = TypeVar("T")
 
@@ -18,7 +23,38 @@ def track(items: Iterable[T], title: str, total: int) -> Iterator[T]:
     from rich.console import Console
     from rich.progress import track as rich_track
 
-    yield from rich_track(items, title, total, console=Console(stderr=True), transient=True)
+    yield from rich_track(items, title, total, console=Console(stderr=True), transient=True,
+                          get_time=compilation.working_time)
+
+
+class Pace:
+    """How long the rest will take.
+
+    Args:
+      total: of what is to be done.
+      done: before it began.
+      clock: s; one that stands still while something is compiled.
+    """
+
+    def __init__(self, total: int, done: int,
+                 clock: Callable[[], float] = compilation.working_time):
+        self._total, self._first, self._clock = total, done, clock
+        self._begun = clock()
+
+    def left(self, done: int) -> float | None:
+        """Seconds left, with so much done by now; None where nothing tells."""
+        made = done - self._first
+        if made <= 0:
+            return None
+        return max(self._total - done, 0) * (self._clock() - self._begun) / made
+
+
+def hours(seconds: float | None) -> str:
+    """As h:mm:ss."""
+    if seconds is None:
+        return "-:--:--"
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
 
 
 @contextmanager
@@ -31,15 +67,16 @@ def bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int, str], 
         yield lambda done, words: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    # The estimate must outlive a long silence: a chunk of training can take minutes.
+    pace = Pace(total, done)
     with Progress(TextColumn("{task.description}"), BarColumn(bar_width=10),
-                  TimeRemainingColumn(), TextColumn("{task.fields[words]}"),
-                  console=Console(stderr=True), transient=True,
-                  speed_estimate_period=1800) as progress:
-        task = progress.add_task(title, total=total, completed=done, words="")
-        yield lambda done, words: progress.update(task, completed=done, words=words)
+                  TextColumn("{task.fields[left]}", style="progress.remaining"),
+                  TextColumn("{task.fields[words]}"),
+                  console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(title, total=total, completed=done, words="", left=hours(None))
+        yield lambda done, words: progress.update(task, completed=done, words=words,
+                                                  left=hours(pace.left(done)))
 
 
 @contextmanager
