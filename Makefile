@@ -9,7 +9,8 @@ STAMP := .venv/.installed
 .PHONY: demo test soak fuzz hashes lint docs tutorials check wheel clean
 
 demo: $(STAMP)
-	$(BIN)/moonteam rollout outpost --planner policy --out runs/demo --force
+	$(BIN)/moonteam rollout outpost --planner policy --policy any_team_mappo --decode best-of-16 \
+	  --out runs/demo --force
 	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.html"
 
 test: $(STAMP)

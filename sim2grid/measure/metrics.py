@@ -117,6 +117,15 @@ class GridPlan(msgspec.Struct, frozen=True):
     moves: int
 
 
+class Optimum(msgspec.Struct, frozen=True):
+    """The first plan beside the certified optimum, see `measure.optimum`."""
+
+    plan_s: float
+    optimum_s: float
+    plan_steps: int | None = None  # None by the clock
+    optimum_steps: int | None = None
+
+
 class Report(msgspec.Struct, frozen=True):
     """`report.json`: everything but wall-clock time, so equal seeds give equal reports."""
 
@@ -138,6 +147,7 @@ class Report(msgspec.Struct, frozen=True):
     targets: tuple[TargetReport, ...]
     robots: tuple[RobotReport, ...]
     expected_s: float | None = None  # by the clock, what the first plan took in all
+    optimum: Optimum | None = None  # of a rollout, where it is proved in time
 
 
 def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]:

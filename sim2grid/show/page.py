@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from moonteam import files
-from sim2grid.measure.metrics import Report
+from sim2grid.measure.metrics import Optimum, Report
 from sim2grid.show.picture import robot_color
 from sim2grid.show.plots import hexed
 
@@ -174,7 +174,8 @@ def requirement(skills: Sequence[str], kind: str) -> str:
 def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
                  replans: Sequence[tuple[float, int, str]] = (),
                  plots: Sequence[tuple[str, str]] = (), timing: dict[str, float] | None = None,
-                 mission: str = "", replay: str = "", optimum: Sequence[str] = ()) -> str:
+                 mission: str = "", why: str = "", replay: str = "",
+                 optimum: Sequence[str] = ()) -> str:
     """A rollout's page.
 
     Args:
@@ -186,6 +187,7 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
       plots: (title, SVG).
       timing: wall-clock times.
       mission: the mission file's text.
+      why: the engine is this one.
       replay: in 3-D, as `replay.replay` makes it.
       optimum: lines on what the best plan would have taken.
     """
@@ -197,14 +199,15 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
     return page(f"{report.mission}: moonteam rollout", [
         f"<h1>{html.escape(report.mission)}: {verdict}</h1>",
         f'<p class="sub">{html.escape(who)}, {html.escape(report.mode)}, '
-        f"{html.escape(report.backend)}, seed {report.seed}"
+        f"{html.escape(report.backend)}{html.escape(why and f' ({why})')}, seed {report.seed}"
         + (f". {html.escape(report.detail)}" if report.detail else "") + "</p>",
         tiles([
             ("targets solved", f"{solved} of {len(report.targets)}"),
             ("mission seconds", round(report.seconds, 1)), ("decisions", report.decisions),
             *([("planned seconds", report.expected_s)] if report.expected_s else
               [("of the grid plan", grid.makespan if grid else None),
-               ("inflation", report.inflation)]), ("moves", report.moves),
+               ("inflation", report.inflation)]),
+            *([] if report.optimum is None else _beside(report.optimum)), ("moves", report.moves),
             ("causes of new plans", len(replans)),
             *([("times real time", timing["real_time_factor"])]
               if timing and "real_time_factor" in timing else [])]),
@@ -219,6 +222,15 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
         "<h2>Paths</h2>", picture(out / "paths.png", "paths on the map"),
         "<h2>Make it again</h2>", f"<pre>{html.escape(command)}</pre>",
         folded("mission file", mission) if mission else ""])
+
+
+def _beside(best: Optimum) -> list[tuple[str, Any]]:
+    """The plan and the certified optimum, as tiles."""
+    steps = [] if best.plan_steps is None else [
+        ("plan, steps", best.plan_steps), ("certified optimum, steps", best.optimum_steps)]
+    at = "" if best.plan_steps is None else " at travelling speed"
+    return [*steps, (f"plan, s{at}", round(best.plan_s, 1)),
+            (f"certified optimum, s{at}", round(best.optimum_s, 1))]
 
 
 def _targets(report: Report) -> str:

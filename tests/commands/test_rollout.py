@@ -162,6 +162,46 @@ def test_a_failed_mission_exits_with_one_and_without_opengl_shows_the_map(
     assert not (out / "video.mp4").exists()
 
 
+def test_on_a_cpu_the_engine_is_the_faster_one_and_said(tmp_path, capsys, monkeypatch):
+    file, out = tmp_path / "tiny.yaml", tmp_path / "out"
+    file.write_text(GOOD)
+    words = ["rollout", str(file), "--planner", "exact", "--no-video", "--out", str(out)]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert "moonteam: engine native: C MuJoCo, three times as fast" in captured.err
+    assert ", native" in captured.out
+    report = json.loads((out / "report.json").read_text())
+    assert report["backend"] == "native"
+    page = (out / "report.html").read_text()
+    assert "native (C MuJoCo, three times as fast" in page
+    assert "--backend native" in page  # of the command that makes it again
+    assert "C MuJoCo" in json.loads((out / "config.json").read_text())["engine"]
+
+
+def test_the_plan_stands_beside_the_certified_optimum(tmp_path, capsys):
+    """Greedy's plan of a mission in which the nearest target first is the longer way."""
+    file = tmp_path / "line.yaml"
+    file.write_text(GOOD.replace("size: [3, 3]", "size: [6, 3]").replace(
+        "start: [1, 0]", "start: [5, 2]").replace("targets:", (
+            "targets:\n  - {name: far, at: [4, 0], skills: [A]}")))
+    for number, planner in enumerate(("exact", "greedy")):
+        out = tmp_path / planner
+        assert main(["rollout", str(file), "--planner", planner, "--no-video",
+                     "--out", str(out)]) == 0
+        report = json.loads((out / "report.json").read_text())
+        best, plan = report["optimum"], report["grid_plan"]["makespan"]
+        assert best["plan_steps"] == plan
+        assert best["optimum_steps"] <= plan
+        if not number:
+            optimum = plan
+            assert best["optimum_steps"] == plan
+        assert best["optimum_steps"] == optimum
+        said = capsys.readouterr().out
+        assert f"plan {plan} steps (" in said
+        assert f"certified optimum {optimum} steps (" in said
+        assert "certified optimum, steps" in (out / "report.html").read_text()
+
+
 def test_an_interrupted_rollout_saves_what_is_done(tmp_path, capsys, monkeypatch):
     class Stopped(NativeBackend):
         calls = 0
