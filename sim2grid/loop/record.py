@@ -1,7 +1,8 @@
 """What happened in one execution: written by the executor, read by metrics and drawings.
 
 Legend: R robots, M targets, T logged moments (the first is the start), nq as in MuJoCo.
-Seconds are mission seconds, decisions count joint actions from 0.
+Seconds are mission seconds. A decision's number, counted from 1, is of the last joint action that
+was done by then, 0 before the first.
 """
 
 from __future__ import annotations

@@ -154,9 +154,8 @@ class Impassable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Something that happens at decision `at_decision`; one of the other keys says what.
-
-    By the clock it happens at second `at_s`.
+    """Something that happens when decision `at_decision`, counted from 1, is done; one of the
+    other keys says what. By the clock it happens at second `at_s`.
     """
 
     at_decision: int = 0
@@ -396,7 +395,8 @@ def _check_when(mission: Mission, event: Event, source: object, key: str) -> Non
         raise InputError(source, "is for missions by the clock; say clock: seconds too, or "
                          "at_decision", f"{key}.at_s")
     elif not 1 <= event.at_decision <= MOST_STEPS:
-        raise InputError(source, f"{event.at_decision} is not allowed; 1 to {MOST_STEPS}",
+        raise InputError(source, f"{event.at_decision} is not allowed; decisions are counted from "
+                         f"1, and an event comes when one is done: 1 to {MOST_STEPS}",
                          f"{key}.at_decision")
 
 
