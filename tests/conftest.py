@@ -17,6 +17,15 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 @pytest.fixture(scope="session")
+def jaxmarl():
+    """JaxMARL's modules; importing them prints, which is not wanted where nobody asks."""
+    import jaxmarl.environments.multi_agent_env as base
+    import jaxmarl.environments.spaces as spaces
+    import jaxmarl.wrappers.baselines as wrappers
+    return {"base": base, "spaces": spaces, "wrappers": wrappers}
+
+
+@pytest.fixture(scope="session")
 def pointing(tmp_path_factory):
     """A policy file of kind pointer with random weights: it solves everything, in a poor order."""
     from dataclasses import asdict

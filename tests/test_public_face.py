@@ -1,17 +1,20 @@
 """What `moonteam/__init__.py` names: every block of Python in the documents runs as it stands."""
 
+import importlib.util
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
 
 import moonteam
-from moonteam import cli, files
+from moonteam import api, cli, files, results
 from moonteam.planners import registry as planners
 from moonteam.policies.policy import Policy
+from moonteam.results import Rollout, Training
 from moonteam.robots import KINDS
 
 TOP = Path(__file__).parents[1]
@@ -29,7 +32,9 @@ def blocks():
     for page in PAGES:
         text = (TOP / page).read_text(encoding="utf-8")
         for number, found in enumerate(re.finditer(r"```python\n(.*?)```", text, re.DOTALL)):
-            yield pytest.param(found[1], id=f"{page}-{number}")
+            needs = "pettingzoo" in found[1] and importlib.util.find_spec("pettingzoo") is None
+            yield pytest.param(found[1], id=f"{page}-{number}", marks=pytest.mark.skipif(
+                needs, reason="pettingzoo is not installed"))
 
 
 @pytest.mark.parametrize("block", list(blocks()))
@@ -97,6 +102,11 @@ def test_plan_follows_the_clock(capsys):
     (lambda: moonteam.rollout("outpost", backnd="native"), "did you mean backend"),
     (lambda: moonteam.evaluate("3x5", decod="argmax"), "did you mean decode"),
     (lambda: moonteam.train("smal"), "small"),
+    (lambda: moonteam.train("small", sed=1), "--sed 1: not understood"),
+    (lambda: moonteam.make("MoonGrid"), "did you mean MoonGrid-v0"),
+    (lambda: moonteam.make("MoonGrid-v0", confg="pi_5t"), "did you mean config"),
+    (lambda: moonteam.make("MoonGrid-v0", config="pi_5"), "pi_5t"),
+    (lambda: moonteam.make("MoonGrid-v0", face="gym"), "jaxmarl or pettingzoo"),
     (lambda: moonteam.register(3), "neither"),
     (lambda: moonteam.register(KINDS.get("drone"), "other"), "own name"),
     (lambda: Policy.load("any_taem"), "any_team")])
@@ -108,7 +118,79 @@ def test_a_mistake_is_named(call, says):
 def test_a_mission_made_in_python_is_driven_and_written(tmp_path):
     demo = moonteam.load("demo")
     mission = msgspec.structs.replace(demo, targets=demo.targets[:1], name="one target")
-    report = moonteam.rollout(mission, "exact", backend="native", video=False, out=tmp_path)
-    assert report.success
-    assert len(report.targets) == 1
+    driven = moonteam.rollout(mission, "exact", backend="native", out=tmp_path)
+    assert driven.success
+    assert len(driven.targets) == 1
     assert moonteam.load(tmp_path / "mission.yaml") == mission
+    assert driven.folder == tmp_path
+    assert driven.report.decisions == len(driven.record.decisions)
+    assert driven.seconds == pytest.approx(driven.record.seconds())
+    assert not (tmp_path / "video.mp4").exists()
+    page = driven._repr_html_()
+    assert "one target" in page
+    assert "data:image/png;base64," in page, "the map, while there is no film"
+
+
+def test_a_film_is_made_when_it_is_asked_for(tmp_path):
+    """Where it goes, and what a notebook then shows; what is in it is for other tests."""
+    drawn = []
+
+    def film(path):
+        drawn.append(path)
+        path.write_bytes(b"film")
+
+    report = SimpleNamespace(mission="<m>", success=False, detail="a & b", cause="engine",
+                             seconds=2.5, planner="exact", targets=(), robots=())
+    driven = Rollout(report, None, tmp_path, film)
+    assert driven.save_video() == tmp_path / "video.mp4" == driven.video
+    assert driven.save_video(tmp_path / "other.mp4") == drawn[1]
+    page = driven._repr_html_()
+    assert '<video controls style="max-width:640px" src="data:video/mp4;base64,ZmlsbQ=="' in page
+    assert "&lt;m&gt;</b>: failed: a &amp; b, 2.5 s" in page
+    with pytest.raises(moonteam.InputError, match=r"\.mp4"):
+        driven.save_video(tmp_path / "film.avi")
+    assert len(drawn) == 2
+
+
+def test_what_is_evaluated_comes_in_flat_rows():
+    report = moonteam.evaluate("3x5", ["greedy", "exact"], limit=3)
+    assert isinstance(report, dict), "the document of the command"
+    assert len(report.rows) == 6
+    for row in (*report.rows, *report.summary):
+        assert all(isinstance(v, (str, int, float, bool, type(None))) for v in row.values())
+    best = report.summary[1]
+    assert best["planner"] == "exact"
+    assert best["intervals.makespan.0"] <= best["makespan"] <= best["intervals.makespan.1"]
+    assert "<td>exact</td>" in report._repr_html_()
+    table = pytest.importorskip("pandas").DataFrame(report.rows)
+    assert table.groupby("planner").makespan.mean()["exact"] == best["makespan"]
+    assert report.to_pandas().equals(table)
+
+
+def test_a_run_of_training_is_read_back(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"update": 1, "gap": [0.5, null]}\n{"update": 2}\n')
+    files.write_json(tmp_path / "report.json", {"preset": "small", "held_out": {"3x5": 0.25}})
+    run = Training.of(tmp_path)
+    assert run.rows == [{"update": 1, "gap.0": 0.5, "gap.1": None}, {"update": 2}]
+    assert Path(run) == tmp_path
+    assert run.policy == tmp_path / "policy.safetensors"
+    assert "<td>held_out.3x5</td><td>0.25</td>" in run._repr_html_()
+
+
+def test_without_pandas_it_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(moonteam.InputError, match="pip install pandas"):
+        results.frame([])
+
+
+def test_keywords_of_a_training_are_words_of_the_command():
+    assert list(api._words({"seed": 1, "resume": True, "stop_on_collapse": False, "begin": None,
+                            "bootstrap": {"num_envs": 32, "lr": 1e-3, "both": (1, 2)}})) == [
+        "--seed", "1", "--resume", "--no-stop-on-collapse", "--bootstrap.num-envs", "32",
+        "--bootstrap.lr", "0.001", "--bootstrap.both", "1", "2"]
+
+
+def test_without_pettingzoo_it_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pettingzoo", None)
+    with pytest.raises(moonteam.InputError, match=r"moonteam\[pettingzoo\]"):
+        moonteam.make("MoonGrid-v0", face="pettingzoo")

@@ -106,6 +106,12 @@ class TimedExecution:
         """The grid as last decided on."""
         return self.known.snapshot
 
+    @property
+    def choosing(self) -> npt.NDArray[np.bool_]:
+        """[R] robots that can be sent elsewhere: of the team, heard of and in no service."""
+        serving = np.array([errand.phase == "serving" for errand in self.errands])
+        return self.known.mask & ~serving & ~(self._happenings.silent_until > self.book.time)
+
     def moment(self) -> Moment:
         """The mission as it stands."""
         return self.task.as_it_stands(
@@ -176,9 +182,8 @@ class TimedExecution:
         self.record.decisions.append(Decision(
             book.decision, book.time, known.snapshot.cells.copy(), chosen.astype(np.int32),
             self.solved.copy()))
-        heard = known.mask & ~(self._happenings.silent_until > book.time)
-        for i, errand in enumerate(self.errands):
-            if heard[i] and errand.phase != "serving" and chosen[i] != errand.choice:
+        for i in np.flatnonzero(self.choosing).tolist():
+            if chosen[i] != self.errands[i].choice:
                 self._choose(i, int(chosen[i]))
         book.decision += 1
 

@@ -20,8 +20,14 @@ def by_the_clock(mission: Mission, source: object) -> Mission:
     return msgspec.structs.replace(mission, clock="seconds")
 
 
-def execution_of(prepared: Prepared, chooser: Chooser, seed: int) -> TimedExecution:
-    """The mission on its ground, before its start."""
-    roads = Roads.of_mission(prepared.site, prepared.mission, team.limits(prepared.kinds))
+def roads_of(prepared: Prepared) -> Roads:
+    """The ways of a mission's ground, which are found as they are asked for."""
+    return Roads.of_mission(prepared.site, prepared.mission, team.limits(prepared.kinds))
+
+
+def execution_of(prepared: Prepared, chooser: Chooser, seed: int,
+                 roads: Roads | None = None) -> TimedExecution:
+    """The mission on its ground, before its start; `roads`, if they are there already."""
+    roads = roads or roads_of(prepared)
     return TimedExecution(prepared.mission, prepared.scenario, chooser, prepared.bodies,
                           prepared.frame, roads, seed=seed)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -157,6 +159,13 @@ def carry_out(args: Args) -> Done:
     out = folder(made.prepared.mission.name, args.out, args.force)
     with outputs.folder(out, FILES, force=args.force):
         return _carry_out(args, made, out)
+
+
+def film(made: Run, path: Path) -> None:
+    """The film of a mission that was run, as one file; see `_save_video`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        os.replace(_save_video(_film(made), made.prepared, Path(folder)), path)
 
 
 def folder(mission: str, out: Path | None, force: bool) -> Path:

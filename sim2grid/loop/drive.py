@@ -107,9 +107,10 @@ def run(executions: Sequence[Driven], backend: Backend, qpos: npt.ArrayLike,
     poses = np.broadcast_to(poses, (len(executions), poses.shape[-1]))
     rows = rows or [k % width for k in range(len(executions))]
     queues = [[k for k, row in enumerate(rows) if row == b] for b in range(width)]
-    fleet = _Rows(executions, backend, poses, queues)
+    fleet = Rows(executions, backend, poses, queues)
     try:
         while fleet.load(finished):
+            fleet.answer()
             fleet.advance()
             progress()
     except KeyboardInterrupt:
@@ -118,7 +119,7 @@ def run(executions: Sequence[Driven], backend: Backend, qpos: npt.ArrayLike,
         raise
 
 
-class _Rows:
+class Rows:
     """The rows of a backend and the executions that take turns in them."""
 
     def __init__(self, executions: Sequence[Driven], backend: Backend, poses: npt.NDArray,
@@ -148,10 +149,9 @@ class _Rows:
         if fresh.any():
             self._reset(fresh)
         self._idle = np.array([k is None for k in self._now])
-        self._answer()
         return not self._idle.all()
 
-    def _answer(self) -> None:
+    def answer(self) -> None:
         """Has the planners answer all questions at once."""
         busy = [self._executions[k] for k in self.busy()]
         asking = [execution for execution in busy if execution.question is not None]

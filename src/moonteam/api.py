@@ -7,11 +7,13 @@ same name does, with the same options under the same names.
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 
@@ -21,19 +23,28 @@ from moonteam.loading import load
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
+from moonteam.registry import Registry
+from moonteam.results import Evaluation, Rollout, Training
 
 if TYPE_CHECKING:  # JAX and MuJoCo, which take seconds, are loaded when they are needed
     from moonteam.planners.base import Plan, Planner
     from moonteam.planners.kind import PlannerKind
     from moonteam.planners.seconds.base import TimedPlan
     from moonteam.robots.base import RobotKind
-    from sim2grid.measure.metrics import Report
 
-__all__ = ["evaluate", "load", "plan", "register", "rollout", "train"]
+__all__ = ["evaluate", "load", "make", "plan", "register", "rollout", "train"]
 
 Named = str | os.PathLike[str]
 WRITTEN = "mission.yaml"
 """What a mission that is an object is written as, for its rollout."""
+ENVIRONMENTS: Registry[Callable[..., Any]] = Registry(
+    "environment", "moonteam.environments", Callable, {  # type: ignore[arg-type]
+        "MoonGrid-v0": "moonteam.grid.jaxmarl_face:MoonGrid",
+        "MoonMacro-v0": "moonteam.grid.jaxmarl_macro:MoonMacro",
+        "MoonMission-v0": "sim2grid.env.mission:MoonMission"})
+"""What `make` makes. What an environment of a name tells, takes and pays does not change: that
+needs the next number.
+"""
 T = TypeVar("T")
 
 
@@ -68,7 +79,7 @@ def plan(what: Named | Mission | Scenario | Timed, planner: str = "exact", **opt
 
 
 def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named | None = None,
-            **options: Any) -> Report:
+            video: bool = False, **options: Any) -> Rollout:
     """A mission in physics, as `moonteam rollout`.
 
     Args:
@@ -78,15 +89,18 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
       out: output folder; runs/NAME by default, or runs/NAME-2 and so on where that holds a
         rollout. A `Mission` is written there as mission.yaml. Nothing there is written over
         without force=True.
-      **options: of the command, such as backend="native", mode="async" or video=False.
+      video: make the video at once; `save_video()` makes it later.
+      **options: of the command, such as backend="native" or mode="async".
 
-    Returns the report that is written as report.json: SI units, `success`, `seconds`,
-    `targets`, `robots`. Raises InputError, and KeyboardInterrupt when stopped (what was done is
+    Returns the `report` that is written as report.json, in SI units (`success`, `seconds`,
+    `targets` and `robots` of it by themselves too), the `record` behind it, and `save_video()`; a
+    notebook shows it. Raises InputError, and KeyboardInterrupt when stopped (what was done is
     saved then).
     """
     command = _command("sim2grid", "rollout")
     folder = None if out is None else Path(out)
-    args = _built(command.Args, "rollout", {"planner": planner, "out": folder, **options})
+    args = _built(command.Args, "rollout",
+                  {"planner": planner, "out": folder, "video": video, **options})
     if isinstance(mission, Mission):
         folder = command.folder(mission.name, folder, args.force)
         with outputs.folder(folder, (*command.FILES, WRITTEN), force=args.force):
@@ -96,7 +110,8 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
         done = command.carry_out(replace(args, mission=os.fspath(mission)))
     if done.interrupted:
         raise KeyboardInterrupt
-    return done.report
+    return Rollout(done.report, done.made.execution.record, done.out,
+                   partial(command.film, done.made), done.video)
 
 
 def _write(folder: Path, mission: Mission) -> Path:
@@ -110,7 +125,7 @@ def _write(folder: Path, mission: Mission) -> Path:
 
 def evaluate(what: Named | Scenario | Timed | Sequence[Scenario] | Sequence[Timed],
              planner: str | Sequence[str] = "exact", *, limit: int | None = None,
-             **options: Any) -> dict[str, Any]:
+             **options: Any) -> Evaluation:
     """Planners side by side on scenarios, as `moonteam evaluate grid`.
 
     Args:
@@ -120,8 +135,9 @@ def evaluate(what: Named | Scenario | Timed | Sequence[Scenario] | Sequence[Time
       **options: of the command, one value or several: policy="any_team",
         decode=("argmax", "best-of-16"), time_limit=0.1.
 
-    Returns the report: `summary` has one row a planner, `rows` one a planner and scenario.
-    Raises InputError, and KeyboardInterrupt when stopped.
+    Returns the document that the command prints as JSON, a dict. Its `summary` has one flat row a
+    planner, its `rows` one a planner and scenario, which `to_pandas()` makes a table of; a
+    notebook shows it. Raises InputError, and KeyboardInterrupt when stopped.
     """
     from moonteam import compilation
     from moonteam.report import command as commands
@@ -143,37 +159,83 @@ def evaluate(what: Named | Scenario | Timed | Sequence[Scenario] | Sequence[Time
                                  f"{title}: {len(found)} scenarios", made_by)
     if "interrupted" in document:
         raise KeyboardInterrupt
-    return document
+    return Evaluation(document)
 
 
-def train(preset: str, *words: str, out: Named | None = None) -> Path:
+def train(preset: str, *words: str, out: Named | None = None, **options: Any) -> Training:
     """Trains a policy, as `moonteam train`.
 
     Args:
       preset: such as "quick", "any_team", "small" or "pi_5t".
       *words: what would stand behind it on the command line, such as "--seed", "1", "--resume".
       out: run folder; runs/PRESET-SEED by default.
+      **options: the same as keywords, groups of options as dicts: seed=1, resume=True,
+        bootstrap={"updates": 20}.
 
-    Returns the run folder, which holds policy.safetensors and report.json. Raises InputError for
-    bad words, KeyboardInterrupt when stopped (go on with "--resume"), RuntimeError if the run
-    failed, which it has said why on standard error.
+    Returns the run: its `folder`, the `policy` in it, its `report`, and its curve as flat `rows`,
+    which `to_pandas()` makes a table of; a notebook shows it. Raises InputError for bad words,
+    KeyboardInterrupt when stopped (go on with resume=True), RuntimeError if the run failed, which
+    it has said why on standard error.
     """
     from moonteam import cli
 
     command = _command("training", "train")
     where = () if out is None else ("--out", os.fspath(out))
+    said = [preset, *words, *_words(options), *where]
     try:
-        args = cli.parse("train", [preset, *words, *where])
+        args = cli.parse("train", said)
     except SystemExit:
-        raise InputError("train", f"{' '.join([preset, *words])}: not understood, see above"
-                         ) from None
+        raise InputError("train", f"{' '.join(said)}: not understood, see above") from None
     folder = command.folder(args)
     code = command.run(args)
     if code == interrupts.CODE:
         raise KeyboardInterrupt
     if code:
         raise RuntimeError(f"training {preset} ended with exit code {code}")
-    return folder
+    return Training.of(folder)
+
+
+def _words(options: dict[str, Any], group: str = "") -> Iterable[str]:
+    """Keyword options as they stand on the command line."""
+    for key, value in options.items():
+        name = f"{group}{key.replace('_', '-')}"
+        if isinstance(value, dict):
+            yield from _words(value, f"{name}.")
+        elif isinstance(value, bool):
+            head, dot, last = name.rpartition(".")
+            yield f"--{name}" if value else f"--{head}{dot}no-{last}"
+        elif isinstance(value, (list, tuple)):
+            yield from (f"--{name}", *map(str, value))
+        elif value is not None:
+            yield from (f"--{name}", str(value))
+
+
+def make(name: str, *, face: Literal["jaxmarl", "pettingzoo"] = "jaxmarl", **options: Any) -> Any:
+    """An environment by its versioned name.
+
+    Args:
+      name: "MoonGrid-v0", the grid, a cell a decision; "MoonMacro-v0", a target a decision, by the
+        clock; "MoonMission-v0", missions in physics; another package's, or FILE.py:OBJECT.
+      face: jaxmarl, with the interface of JaxMARL's `MultiAgentEnv`; or pettingzoo, with that of
+        PettingZoo's `ParallelEnv` (extra `pettingzoo`).
+      **options: of the environment: config="pi_5t", family=Draw(...), mission="sampling".
+
+    Raises InputError for a name or an option that is not there, or one that is not allowed.
+    """
+    made_by = ENVIRONMENTS.get(name, None)
+    parameters = inspect.signature(made_by).parameters
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        for key in options:
+            if key not in parameters:
+                raise _unknown(f"make({key}=)", key, list(parameters))
+    if face not in ("jaxmarl", "pettingzoo"):
+        raise InputError("make(face=)", f"{face!r} is not allowed; jaxmarl or pettingzoo")
+    env = made_by(**options)
+    if face == "jaxmarl":
+        return env
+    from moonteam.grid import pettingzoo_face
+
+    return pettingzoo_face.parallel(env, name)
 
 
 def register(thing: RobotKind | PlannerKind | Callable[..., Planner], name: str = "") -> None:
@@ -208,9 +270,12 @@ def _built(kind: type[T], call: str, options: dict[str, Any]) -> T:
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     for key in options:
         if key not in known:
-            raise InputError(f"{call}({key}=)", f"no such option; {meant(key, known)}allowed: "
-                             + ", ".join(known))
+            raise _unknown(f"{call}({key}=)", key, known)
     return kind(**options)
+
+
+def _unknown(source: str, key: str, known: Sequence[str]) -> InputError:
+    return InputError(source, f"no such option; {meant(key, known)}allowed: {', '.join(known)}")
 
 
 def _several(value: Any) -> tuple:

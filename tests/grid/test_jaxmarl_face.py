@@ -122,15 +122,3 @@ def test_log_wrapper_under_jit_and_vmap(jaxmarl, env):
         assert info["returned_episode_lengths"][t, e, 0] == t + 1 <= CONFIG.max_steps
         np.testing.assert_allclose(info["returned_episode_returns"][t, e, 0],
                                    rewards[:t + 1, e].sum(), rtol=1e-5)
-
-
-def test_rollout_manager_takes_jaxmarls_own_spaces(jaxmarl):
-    env = grid.MoonGrid(CONFIG, spaces=jaxmarl["spaces"])
-    manager = jaxmarl["wrappers"].CTRolloutManager(env, batch_size=4)
-    observations, state = manager.batch_reset(jax.random.key(0))
-    assert observations["__all__"].shape == (4, 2 * CONFIG.obs_dim)
-    assert observations["agent_0"].shape == (4, CONFIG.obs_dim + 2)
-    actions = {a: manager.batch_sample(jax.random.key(1), a) for a in env.agents}
-    _, _, rewards, dones, _ = manager.batch_step(jax.random.key(2), state, actions)
-    np.testing.assert_allclose(rewards["__all__"], rewards["agent_0"] + rewards["agent_1"])
-    assert dones["__all__"].shape == (4,)

@@ -80,14 +80,3 @@ def test_log_wrapper_under_jit_and_vmap(jaxmarl, env):
     assert (rewards <= 0).all()
     assert info["returned_episode"].sum() >= 8
     assert info["terminated"].sum() == info["returned_episode"].sum(), "no episode is cut off"
-
-
-def test_rollout_manager_takes_jaxmarls_own_spaces(jaxmarl):
-    env = grid.MoonMacro(FAMILY, spaces=jaxmarl["spaces"])
-    manager = jaxmarl["wrappers"].CTRolloutManager(env, batch_size=4)
-    observations, state = manager.batch_reset(jax.random.key(0))
-    assert observations["agent_0"].shape[0] == 4
-    actions = {a: manager.batch_sample(jax.random.key(1), a) for a in env.agents}
-    _, _, rewards, dones, _ = manager.batch_step(jax.random.key(2), state, actions)
-    np.testing.assert_allclose(rewards["__all__"], rewards["agent_0"] * 3, rtol=1e-6)
-    assert dones["__all__"].shape == (4,)

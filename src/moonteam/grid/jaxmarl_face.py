@@ -1,6 +1,6 @@
 """The grid environment with the interface of JaxMARL's `MultiAgentEnv`, without importing it.
 
-    env = MoonGrid(preset_config("pi_5t"))
+    env = MoonGrid("pi_5t")
     observations, state = env.reset(key)
     observations, state, rewards, dones, infos = env.step(key, state, actions)
 
@@ -19,6 +19,7 @@ from jax import Array
 from moonteam.grid import env
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.observe import observe
+from moonteam.grid.rewards import preset_config
 from moonteam.grid.types import State
 from moonteam.problem.rules import NUM_ACTIONS
 
@@ -72,10 +73,16 @@ class OwnSpaces:
 
 
 class Face:
-    """What our environments have in common: agents, their spaces, the automatic reset."""
+    """What our environments have in common: agents, their spaces, the automatic reset.
 
-    def __init__(self, num_agents: int, observation: Any, action: Any):
-        self.num_agents = num_agents
+    With `world_state` observations hold "world_state" too, [state_size] float32: all agents'
+    observations side by side, for JaxMARL's scripts that read it from the environment (SMAX's).
+    """
+
+    def __init__(self, num_agents: int, observation: Any, action: Any, world_state: bool = False):
+        self.num_agents = self.num_allies = num_agents
+        self.state_size = num_agents * observation.shape[0]
+        self._world_state = world_state
         self.agents = [f"agent_{i}" for i in range(num_agents)]
         self.observation_spaces = dict.fromkeys(self.agents, observation)
         self.action_spaces = dict.fromkeys(self.agents, action)
@@ -120,7 +127,7 @@ class Face:
         Args:
           key: JAX key, drawn from only for the new episode.
           state: as from `reset` or `step`.
-          actions: [] int32 by agent.
+          actions: [] or [1] integer by agent.
           reset_state: what to begin again from; None: a random problem.
 
         Returns:
@@ -142,30 +149,44 @@ class Face:
     def _split(self, values: Array) -> ByAgent:
         return {agent: values[i] for i, agent in enumerate(self.agents)}
 
+    def _observed(self, observation: Array) -> ByAgent:
+        """Observations [N, D] by agent, and the world state where it is asked for."""
+        whole = {"world_state": observation.reshape(-1)} if self._world_state else {}
+        return self._split(observation) | whole
+
+    def _joint(self, actions: ByAgent) -> Array:
+        """[N] int32. JaxMARL's recurrent MAPPO hands each agent an action of shape [1]."""
+        return jnp.stack([jnp.reshape(jnp.asarray(actions[agent]), ()).astype(jnp.int32)
+                          for agent in self.agents])
+
 
 class MoonGrid(Face):
     """The grid as a JaxMARL environment; actions are up, down, left, right, stay.
 
     Args:
-      config: the family of problems that `reset` samples, and the rewards.
+      config: the family of problems that `reset` samples, and the rewards; or the name of a
+        preset, such as "pi_5t".
       spaces: where `Discrete` and `Box` come from. Wrappers that look at the class of a
         space (JaxMARL's CTRolloutManager) need `jaxmarl.environments.spaces` here.
+      world_state: whether observations hold "world_state" too, see `Face`.
     """
 
-    def __init__(self, config: EnvConfig | None = None, spaces: Spaces | None = None):
-        self.config = config or EnvConfig()
+    def __init__(self, config: EnvConfig | str | None = None, spaces: Spaces | None = None,
+                 world_state: bool = False):
+        named = preset_config(config) if isinstance(config, str) else config
+        self.config = named or EnvConfig()
         maker = spaces or OwnSpaces
         bound = float(max(self.config.width - 1, self.config.height - 1,
                           2**self.config.num_skills - 1))
         super().__init__(self.config.num_agents,
                          maker.Box(-bound, bound, (self.config.obs_dim,)),
-                         maker.Discrete(NUM_ACTIONS))
+                         maker.Discrete(NUM_ACTIONS), world_state)
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: Array) -> tuple[ByAgent, State]:
         """A new episode: observations by agent, and the state."""
         state, observation = env.reset(self.config, key)
-        return self._split(observation), state
+        return self._observed(observation), state
 
     def step_env(self, key: Array, state: State, actions: ByAgent,
                  ) -> tuple[ByAgent, State, ByAgent, ByAgent, dict[str, Array]]:
@@ -174,7 +195,7 @@ class MoonGrid(Face):
         Infos: [N] arrays `terminated`, `truncated` and `true_moves`.
         """
         del key
-        result = env.step(self.config, state, jnp.stack([actions[a] for a in self.agents]))
+        result = env.step(self.config, state, self._joint(actions))
         ended = result.terminated | result.truncated
         dones = dict.fromkeys([*self.agents, "__all__"], ended)
         everyone = (self.num_agents,)
@@ -183,12 +204,12 @@ class MoonGrid(Face):
             "truncated": jnp.broadcast_to(result.truncated, everyone),
             "true_moves": result.true_moves,
         }
-        return self._split(result.observation), result.state, self._split(result.reward), dones, \
-            infos
+        return (self._observed(result.observation), result.state, self._split(result.reward),
+                dones, infos)
 
     def get_obs(self, state: State) -> ByAgent:
         """Observations [D] by agent."""
-        return self._split(observe(self.config, state))
+        return self._observed(observe(self.config, state))
 
     @partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: State) -> ByAgent:

@@ -34,16 +34,18 @@ class MoonMacro(Face):
     Args:
       family: the problems that `reset` draws.
       spaces: as of `MoonGrid`.
+      world_state: as of `MoonGrid`.
     """
 
-    def __init__(self, family: Draw | None = None, spaces: Spaces | None = None):
+    def __init__(self, family: Draw | None = None, spaces: Spaces | None = None,
+                 world_state: bool = False):
         self.family = family or Draw()
         maker = spaces or OwnSpaces
         self.num_targets = self.family.targets[1]
         agents, targets, skills = self.family.agents[1], self.num_targets, self.family.num_skills
         length = agents * (2 * targets + skills + 2) + targets * (skills + 4)
         super().__init__(agents, maker.Box(0.0, max(LONG, agents), (length,)),
-                         maker.Discrete(targets + 1))
+                         maker.Discrete(targets + 1), world_state)
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: Array) -> tuple[ByAgent, MacroState]:
@@ -63,7 +65,7 @@ class MoonMacro(Face):
         Infos: [N] arrays `terminated`, `truncated` and `seconds` (that passed).
         """
         del key
-        wanted = jnp.stack([actions[a] for a in self.agents])
+        wanted = self._joint(actions)
         liking = 2.0 * jax.nn.one_hot(wanted, self.num_targets + 1)
         liking = liking.at[:, -1].add(1.0)
         choice, _ = world.choose(state, liking, jnp.zeros_like(liking))
@@ -93,9 +95,9 @@ class MoonMacro(Face):
             units(problem.appears - state.now)[:, None],
             world.missing(problem, state.goal)], axis=1)
         told = jnp.where(open_[:, None], told, 0.0).reshape(-1)
-        own = [jnp.concatenate([rows[i], jnp.delete(rows, i, axis=0).reshape(-1), told])
-               for i in range(self.num_agents)]
-        return dict(zip(self.agents, own, strict=True))
+        return self._observed(jnp.stack([
+            jnp.concatenate([rows[i], jnp.delete(rows, i, axis=0).reshape(-1), told])
+            for i in range(self.num_agents)]))
 
     @partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: MacroState) -> ByAgent:

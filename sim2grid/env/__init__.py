@@ -1,0 +1,1 @@
+"""Missions in physics as an environment: choices in, observations and seconds out."""
