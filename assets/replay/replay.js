@@ -8,6 +8,7 @@ const part = name => root.querySelector(name);
 const TYPES = { u1: Uint8Array, u2: Uint16Array, f4: Float32Array };
 const SPEED_WINDOW = 0.6;  // s, as in the film
 const AT_REST = 0.12;  // m/s, as in the film
+const LABEL = 21;  // pixels, with the room about the letters
 const PACES = [1, 2, 3, 5, 8, 10, 15, 20];
 
 async function unpack(text) {
@@ -238,7 +239,8 @@ function line(ground, from, to, lift) {
   });
 }
 
-function label(text, colour, size = 1) {
+// Words that stand upright; `resize` says how large.
+function label(text, colour) {
   const canvas = document.createElement('canvas'), pen = canvas.getContext('2d');
   const font = 'bold 44px system-ui, "DejaVu Sans", sans-serif';
   pen.font = font;
@@ -256,7 +258,7 @@ function label(text, colour, size = 1) {
   texture.colorSpace = THREE.SRGBColorSpace;
   const found = new THREE.Sprite(new THREE.SpriteMaterial({
     map: texture, sizeAttenuation: false, depthTest: false, transparent: true }));
-  found.scale.set(0.028 * size * canvas.width / canvas.height, 0.028 * size, 1);
+  found.userData.ratio = canvas.width / canvas.height;
   found.center.set(0.5, 0);
   found.renderOrder = 2;
   return found;
@@ -474,7 +476,13 @@ class Replay {
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, true);
     this.camera.aspect = width / height;
+    // A narrow window sees as far to the sides as a wide one.
+    this.camera.fov = 2 * Math.atan(Math.max(0.364, 0.63 * height / width)) * 180 / Math.PI;
     this.camera.updateProjectionMatrix();
+    const tall = LABEL * 2 * Math.tan(this.camera.fov * Math.PI / 360) / height;
+    this.scene.traverse(one => {
+      if (one.isSprite) one.scale.set(tall * one.userData.ratio, tall, 1);
+    });
     this.draw();
   }
 

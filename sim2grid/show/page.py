@@ -35,8 +35,8 @@ table{border-collapse:collapse;width:100%;font-size:13px;font-variant-numeric:ta
 th,td{padding:5px 9px;border-bottom:1px solid #262d3f}td.n,th.n{text-align:right}
 video,img{max-width:100%;border-radius:8px}.plot img{display:block;width:100%}
 .two{display:grid;grid-template-columns:1fr 1fr;gap:12px}
-pre,code{background:#181d2b;border-radius:6px;font-size:12px}pre{padding:10px;overflow-x:auto}
-code{padding:1px 5px;overflow-wrap:anywhere}summary{cursor:pointer;color:#9fb4d8}
+pre,code{background:#181d2b;border-radius:6px;font-size:12px;overflow-wrap:anywhere}
+pre{padding:10px;white-space:pre-wrap}code{padding:1px 5px}summary{cursor:pointer;color:#9fb4d8}
 .replay canvas{display:block;width:100%;border-radius:8px;touch-action:none}
 .stage{position:relative}.told{position:absolute;left:10px;top:8px;right:10px;font-size:13px;
  font-weight:600;text-shadow:0 0 4px #000,0 0 4px #000;pointer-events:none}
@@ -55,7 +55,7 @@ svg.map{width:100%;border-radius:6px}.gantt text{font-size:11px}.map text{font-w
  text-anchor:middle;paint-order:stroke;stroke:#0e111a}.gantt .who{text-anchor:end;font-weight:600}
 .gantt .what{text-anchor:end;fill:#0e111a;font-size:10px;font-weight:700}
 .gantt .axis{text-anchor:middle;font-size:10px;fill:#aab2c3}
-.film pre{white-space:pre-wrap;overflow-wrap:anywhere}.film p{margin:6px 0 0}
+.film p{margin:6px 0 0}
 @media(max-width:640px){body{padding:12px}.two,.run{grid-template-columns:1fr}h1{font-size:21px}
  svg.map{max-width:240px}.gantt text{font-size:17px}.gantt .what,.gantt .axis{font-size:14px}
  thead{display:none}table,tbody,tr,td{display:block}tr{padding:6px 0;
@@ -234,7 +234,7 @@ def _beside(best: Optimum) -> list[tuple[str, Any]]:
 
 
 def _targets(report: Report) -> str:
-    return table(
+    return known(
         ["target", "cell", "needs", "solved", "decision", "time s", "planned s", "by",
          "distance m"],
         [(t.name, f"{t.at[0]}, {t.at[1]}", requirement(t.skills, t.type), t.solved, t.decision,
@@ -243,7 +243,7 @@ def _targets(report: Report) -> str:
 
 
 def _robots(report: Report) -> str:
-    return table(
+    return known(
         ["robot", "kind", "skills", "moves", "s a move", "way m", "off track rms m", "95 % m",
          "tilt deg", "slip", "late", "wrong cell", "energy kJ", "propellant g", "lost"],
         [(name_of_robot(i, r.name), r.kind, "".join(r.skills), r.moves, r.seconds_per_move,

@@ -1,11 +1,13 @@
 """HTML pages: whole, escaped, self-contained; the evaluation's page says what its report says."""
 
+import colorsys
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
+from moonteam.planners.plans import figure
 from sim2grid.frame import Frame
 from sim2grid.measure.metrics import GridPlan, make_report
 from sim2grid.measure.story import Story
@@ -218,17 +220,25 @@ def test_robots_keep_their_colours_to_themselves():
     assert not set(plots.SERIES) & set(ROBOTS)
 
 
+def test_a_robot_has_one_hue_in_films_and_on_paper():
+    def hue(red, green, blue):
+        return 360 * colorsys.rgb_to_hls(red / 255, green / 255, blue / 255)[0]
+
+    for film, paper in zip(ROBOTS, figure.COLOURS, strict=True):
+        assert hue(*film) == pytest.approx(hue(*bytes.fromhex(paper[1:])), abs=2.0)
+
+
 def test_paths_have_axes_a_scale_starts_and_plans(done, tmp_path):
     _, story = done
-    figure = plots.paths(story, Ground(np.zeros((17, 17)), 0.25), np.eye(4, dtype=bool))
-    axis = figure.axes[0]
+    shown = plots.paths(story, Ground(np.zeros((17, 17)), 0.25), np.eye(4, dtype=bool))
+    axis = shown.axes[0]
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("east, m", "north, m")
     assert axis.get_xlim() == (-2.0, 2.0)
     said = {text.get_text() for text in axis.texts}
     assert {"0.5 m", "T1 A", "T2 B"} <= said
     legend = [text.get_text() for text in axis.get_legend().get_texts()]
     assert legend == ["a", "b", "planned", "driven", "start"]
-    plots.save_png(figure, tmp_path / "paths.png")
+    plots.save_png(shown, tmp_path / "paths.png")
     assert (tmp_path / "paths.png").stat().st_size > 5_000
 
 

@@ -127,9 +127,11 @@ def test_targets_and_events_say_when(told):
         story.record.target_names.pop()
 
 
-PROBE = """
+READY = """
   if (!window.moonteamReplay) await new Promise(
     go => document.addEventListener('moonteam-replay', go));
+"""
+PROBE = READY + """
   const replay = window.moonteamReplay, clock = document.querySelector('.clock');
   const told = () => document.querySelector('.told').textContent;
   const slide = time => { clock.value = time; clock.dispatchEvent(new Event('input')); };
@@ -183,3 +185,6 @@ def test_chromium_plays_it_from_a_file(told, tmp_path):
     assert found["played"] > 1.0
     assert seen.fits
     assert seen.picture.stat().st_size > 20_000
+    narrow = visit(text, tmp_path / "narrow", READY, size=(390, 640))
+    assert narrow.fits
+    assert [c for c in narrow.complaints if "GPU stall" not in c] == []

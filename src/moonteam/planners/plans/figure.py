@@ -20,8 +20,9 @@ from moonteam.planners.base import IntArray, Plan, Snapshot
 from moonteam.planners.simulate import replay
 from moonteam.problem.scenario import Scenario
 
-COLOURS = ("#d1495b", "#00798c", "#edae49", "#5f4b8b", "#3b8b3b", "#c05a1c", "#3d5a80",
-           "#b5508e", "#7a6f3a", "#4a4e69")
+COLOURS = ("#1485b8", "#b89514", "#a114b8", "#14b886", "#b85a14", "#1424b8",
+           "#73b814", "#b81449")
+"""Of robots: those of the films and reports, darker, as paper needs them."""
 INK, PAPER, GROUND = "#22223b", "#fbfaf7", "#eeece6"
 SHADE, FOR_ALL = "#bfb8b0", "#55555f"  # of ground closed to a kind, and to every kind
 
