@@ -284,7 +284,11 @@ def _choices(story: Story, i: int, legs: list[Leg]) -> list[tuple[float, str]]:
     if legs and legs[0].expected_s is not None:
         names = {WAIT: "waits", HOME: "goes home"}
         names |= {j: f"goes for {name}" for j, name in enumerate(record.target_names)}
-        said = [(d.time_s, names[int(d.actions[i])]) for d in record.decisions]
+        # In a service nobody follows what is decided for later.
+        busy = [(s.time_s - record.targets[s.target].service, s.time_s)
+                for s in record.solves if i in s.robots]
+        said = [(d.time_s, names[int(d.actions[i])]) for d in record.decisions
+                if not any(begun <= d.time_s < done for begun, done in busy)]
     else:
         said = [(leg.start_s, f"{ACTIONS[leg.action]}, to cell {leg.goal_cell[0]}, "
                  f"{leg.goal_cell[1]}" if leg.moving else ACTIONS[leg.action]) for leg in legs]

@@ -6,6 +6,7 @@ import json
 import re
 import struct
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from moonteam import paths
 from moonteam.problem.mission import Target
 from sim2grid.loop.prepare import prepare
-from sim2grid.loop.record import Leg, Loss, Record, Solve
+from sim2grid.loop.record import Decision, Leg, Loss, Record, Solve
 from sim2grid.measure.story import Story
 from sim2grid.show import page, replay
 from tests.browser import needs_chromium, visit
@@ -125,6 +126,19 @@ def test_targets_and_events_say_when(told):
     finally:
         story.record.targets.pop()
         story.record.target_names.pop()
+
+
+def test_by_the_clock_a_choice_is_a_target_and_a_service_is_not_left():
+    record = Record([Target((4, 1), ("A",), service=6.0), Target((4, 3), ("A",))], ["one", "two"])
+    nobody = np.zeros((1, 2), np.int32)
+    record.legs.append(Leg(0, 0, 5, (1, 1), (4, 1), np.zeros(2), np.ones(2), 0.0, 30.0,
+                           expected_s=5.0))
+    record.decisions += [Decision(k, time, nobody, np.array([choice]), np.zeros(2, bool))
+                         for k, (time, choice) in enumerate([(0.0, 0), (8.0, -2), (12.0, 1),
+                                                             (20.0, -1)])]
+    record.solves.append(Solve(0, 1, 12.0, (0,), (0.1,)))
+    said = replay._choices(SimpleNamespace(record=record), 0, record.legs)
+    assert said == [(0.0, "goes for one"), (12.0, "goes for two"), (20.0, "waits")]
 
 
 READY = """
