@@ -290,6 +290,8 @@ for (const one of document.querySelectorAll('.film')) one.addEventListener('togg
   const film = document.createElement('video'), link = document.createElement('a');
   film.controls = film.muted = true;
   film.src = one.dataset.film + '/video.mp4';
+  film.addEventListener('error', () => { film.src = one.dataset.film + '/map.mp4'; },
+                        { once: true });  // where no 3-D pictures could be made
   link.href = one.dataset.film + '/report.html';
   link.textContent = 'its page, with the replay in 3-D';
   film.addEventListener('loadeddata', () => one.append(film, link), { once: true });

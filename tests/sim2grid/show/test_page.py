@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from moonteam.planners.plans import figure
+from moonteam.report import video
 from sim2grid.frame import Frame
 from sim2grid.measure.metrics import GridPlan, make_report
 from sim2grid.measure.story import Story
@@ -214,6 +215,21 @@ def test_the_evaluations_page_needs_no_sideways_scroll(clocked, tmp_path, size):
     assert seen.found["width"] == size[0]
     assert seen.found["wide"] == 0
     assert seen.picture.stat().st_size > 20_000
+
+
+@needs_chromium
+def test_a_film_that_was_made_plays_in_its_mission(clocked, tmp_path):
+    film = tmp_path / "films" / "17-closed-exact-clock" / "video.mp4"
+    film.parent.mkdir(parents=True)
+    with video.writing(film, (64, 64), 10, crf=30) as add:
+        for shade in range(5):
+            add(np.full((64, 64, 3), 50 * shade, np.uint8))
+    seen = visit(evaluation_page(clocked, "runs/x/report.json"), tmp_path, """
+        for (const one of document.querySelectorAll('.film')) one.open = true;
+        await new Promise(go => setTimeout(go, 1000));
+        found.films = [...document.querySelectorAll('.film video')].map(
+          one => one.getAttribute('src'));""", size=(1280, 900))
+    assert seen.found["films"] == ["films/17-closed-exact-clock/video.mp4"]
 
 
 def test_robots_keep_their_colours_to_themselves():
