@@ -108,7 +108,8 @@ def _pass(i: int, k: int, xy: Floats, headings: Floats, goals: Floats, moves: bo
     beside = xy[i] + max(front, 0.6) * ahead
     right, other = beside + (side - gap) * left, beside + (side + gap) * left
     if moves and facing > SAME_WAY:
-        return None if front > gap + 0.4 else []
+        first = i < k and float(-away @ headings[k]) > 0.0  # each has the other before it
+        return None if first or front > gap + 0.4 else []
     if moves and facing > HEAD_ON:
         return [] if k < i and front < gap + 1.0 else None
     if moves:

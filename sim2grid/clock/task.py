@@ -62,17 +62,19 @@ class Task(OnGround):
         """Where a robot stands at a target [2] m: in its middle, or in a quarter of its own.
 
         Who needs nobody's help, or has none of its like, those on the ground or those that fly,
-        keeps to the middle. Nobody is sent where another of its like stands or lies (`xy` [R, 2] m,
-        lost where not `present` [R]) or is bound at this target, unless nothing about it is free.
+        keeps to the middle; else the nearest is its own, for between those that stand already there
+        is no way. Nobody is sent where another of its like stands or lies (`xy` [R, 2] m, lost
+        where not `present` [R]) or is bound at this target, unless nothing about it is free.
         """
         centre = self.place(self.targets[target].at)
         alike = self._grounded == self._grounded[robot]
-        mates = self.helpers(present, target, robot) & alike
-        rank = int(mates[:robot].sum())
-        quarters = self._frame.cell_m * np.roll(SLOTS, -rank % len(SLOTS), axis=0)
-        places = [p for p in (*([] if mates.any() else [centre]), *(centre + quarters),
-                              *(centre + FARTHER * quarters))
-                  if not bool(self._frame.off_map(p, 0.0)) and roads.passable(self.kinds[robot], p)]
+        together = bool((self.helpers(present, target, robot) & alike).any())
+        quarters = self._frame.cell_m * SLOTS
+        nearest = [] if together else [centre]
+        for ring in (quarters, FARTHER * quarters):
+            nearest += sorted(centre + ring, key=lambda p: float(metres(p - xy[robot])))
+        places = [p for p in nearest if not bool(self._frame.off_map(p, 0.0))
+                  and roads.passable(self.kinds[robot], p)]
         others = [(k, errands[k].place if present[k] else xy[k])
                   for k in np.flatnonzero(alike).tolist() if k != robot
                   and (errands[k].phase != "going" or errands[k].choice == target)]

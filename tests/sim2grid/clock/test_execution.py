@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from sim2grid.clock import steer
 from sim2grid.clock.roads import OpenGround, Straight
 
 ROVER = {"name": "rover", "kind": "wheeled", "skills": ["A"], "start": [0, 0]}
@@ -188,6 +189,15 @@ def test_two_that_meet_head_on_pass_each_other(mission, drive):
     xy = np.concatenate(done.record.qpos)[:, [0, 1, 7, 8]].reshape(-1, 2, 2)
     assert np.linalg.norm(xy[:, 0] - xy[:, 1], axis=-1).min() > 0.55
     assert done.record.seconds() < 10 / 0.5 + 5
+
+
+def test_of_two_side_by_side_whose_ways_meet_one_goes_on():
+    """Each has the other before it on nearly the same way: both would wait for ever."""
+    xy = np.array([[-1.17, -0.26], [-0.66, -0.15]])
+    aims = np.array([[-0.72, 0.28], [-0.918, 0.918]])
+    _, holds = steer.mind(xy, aims, aims, np.ones(2, bool), np.ones(2, bool), np.full(2, 0.3),
+                          lambda *_: True)
+    assert holds.tolist() == [False, True]
 
 
 def test_nobody_walks_into_a_robot_that_stands(mission, drive):
