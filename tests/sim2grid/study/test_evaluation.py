@@ -305,6 +305,34 @@ def test_the_command_writes_its_folder_and_goes_on_where_it_was_stopped(
     assert "made with other options: seed" in err
 
 
+CLOCKED_MISSION = """
+name: tiny
+clock: seconds
+map: {size: [8, 8], cell_m: 1.0}
+site: {preset: flat, seed: 0}
+robots:
+  - {name: hopper, kind: drone, skills: [eye], start: [1, 1.5]}
+  - {name: rover, kind: wheeled, skills: [eye, drill], start: [5, 1]}
+targets:
+  - {name: look, at: [5.5, 6], skills: [eye], service: 2}
+  - {name: core, at: [4, 3], skills: [drill], after: [look], service: 1}
+"""
+
+
+def test_missions_of_ones_own_by_the_clock_with_a_planner_of_ones_own(sliding, tmp_path):
+    path = tmp_path / "tiny.yaml"
+    path.write_text(CLOCKED_MISSION)
+    code, text, _ = said("--mission", str(path), "demo", "--mode", "clock", "--planner",
+                         f"{CLOCKED}:Nearest", "exact", "--json")
+    assert code == 0
+    report = json.loads(text)
+    assert [(row["report"]["mission"], row["contender"]) for row in report["rows"]] == [
+        (name, f"closed {who} clock") for name in ("tiny", "demo") for who in ("Nearest", "exact")]
+    assert all(row["report"]["success"] for row in report["rows"])
+    assert report["rows"][0]["nominal_s"] > 0
+    assert report["missions"][0]["mission"]["robots"][0]["start"] == [1, 1.5]
+
+
 def test_an_interrupted_command_saves_what_is_done(sliding, tmp_path, monkeypatch):
     keep = evaluation.Group._keep
 
