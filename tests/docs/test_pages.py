@@ -78,7 +78,7 @@ def test_notebooks_and_outside_files_are_pages(site):
     assert (site / "tutorials/plan-and-execute.ipynb").exists()
     assert "class ScoutState" in re.sub(
         "<[^>]*>", "", (site / "repository/examples/scout.html").read_text(encoding="utf-8"))
-    assert 'href="../results/physics.html"' not in text
+    assert 'href="tutorials/train.html"' in (site / "jobs.html").read_text(encoding="utf-8")
     assert "results/physics.html" in (site / "robots.html").read_text(encoding="utf-8")
 
 
