@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from moonteam.compilation import cores
 from moonteam.policies import pointer
 from moonteam.policies.brain import PointerBrain
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import PolicyFile
+from moonteam.report.progress import say
 from training.mappo.macro import grounds
 from training.mappo.macro.config import MacroConfig, Practice
 from training.mappo.macro.curve import draw_curve
@@ -47,6 +50,7 @@ class MacroMappo:
     def __init__(self, config: MacroConfig, params: Any = None, source: str = ""):
         """Makes grounds and environments from the config's seed, parameters too if not given."""
         self.config, self.name, self.seed, self.source = config, config.macro, config.seed, source
+        self._programs: dict[int, jax.stages.Compiled] = {}  # by family, once `enter` was called
         parts = config.hyper.minibatches
         met = [f for f in config.families if f.advantages == "critic"]
         grown = [config.grown(f) for f in config.families if f.advantages == "vine"]
@@ -87,7 +91,42 @@ class MacroMappo:
         return self.config.rounds * self.config.decisions
 
     def enter(self, phase: str) -> None:
-        """There is no other."""
+        """Compiles the families' programs, if they are not yet; there is no other phase."""
+        if self._programs:
+            return
+        families, running = self.config.families, {}
+        # Of several processes, all have to come to each program in the same order.
+        together = 1 if jax.process_count() > 1 else min(cores(), len(families))
+        say(f"moonteam: compiling {len(families)} programs, {together} at once")
+        pool = ThreadPoolExecutor(together)
+        try:
+            # Tracing holds Python, so it is done here, one after the other; XLA lets go of it.
+            for i in range(len(families)):
+                running[pool.submit(self._traced(i).compile)] = i
+            for done, program in enumerate(as_completed(running), 1):
+                i = running[program]
+                self._programs[i] = program.result()
+                say(f"moonteam: compiled {done} of {len(families)}, {families[i].name}")
+        finally:  # an interruption waits for none of them
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _traced(self, i: int) -> jax.stages.Lowered:
+        """The update on a family, which is the config's number i, before XLA compiles it."""
+        config, family, walk = self.config, self.config.families[i], self.walks[i]
+        key, rate = self._key(0, i), np.float32(config.lr)
+        with jax.default_matmul_precision(PRECISION[config.precision]):
+            if walk is None:
+                return improve.lower(
+                    self.mesh, config.spec, family.draw, config.hyper, config.grown(family),
+                    self.grounds[i], self.learner, key, rate)
+            return update.lower(
+                self.mesh, config.spec, family.draw, config.hyper, self.grounds[i], self.learner,
+                walk, key, rate, np.float32(config.ent_coef))
+
+    def _key(self, number: int, i: int) -> Array:
+        """Of round `number` on the config's family number i."""
+        return jax.random.fold_in(jax.random.key(self.config.seed + 1_000_003),
+                                  number * len(self.config.families) + i)
 
     def chunk(self, at: Position) -> Made:
         """`chunk_rounds`, or what is left; each family in turn in every round."""
@@ -99,8 +138,7 @@ class MacroMappo:
             lr = np.float32(config.lr * (1.0 - 0.95 * share))
             entropy = np.float32(config.ent_coef * max(0.0, 1.0 - 1.2 * share))
             for i, family in enumerate(config.families):
-                key = jax.random.fold_in(jax.random.key(config.seed + 1_000_003),
-                                         number * len(config.families) + i)
+                key = self._key(number, i)
                 with jax.default_matmul_precision(PRECISION[config.precision]):
                     reports.append(self.practise(i, family, key, lr, entropy))
         return Made(count, count * config.decisions, _summary(gather(reports)))
@@ -109,14 +147,15 @@ class MacroMappo:
                  entropy: np.float32) -> Report | Grown:
         """One update on a family, which is the config's number i."""
         config, walk = self.config, self.walks[i]
+        made = self._programs.get(i)  # before `enter`, as on the bench, there is none
         if walk is None:
-            self.learner, grown = improve(
-                self.mesh, config.spec, family.draw, config.hyper, config.grown(family),
-                self.grounds[i], self.learner, key, lr)
+            run = made or partial(improve, self.mesh, config.spec, family.draw, config.hyper,
+                                  config.grown(family))
+            self.learner, grown = run(self.grounds[i], self.learner, key, lr)
             return grown
-        self.learner, self.walks[i], report = update(
-            self.mesh, config.spec, family.draw, config.hyper, self.grounds[i], self.learner,
-            walk, key, lr, entropy)
+        run = made or partial(update, self.mesh, config.spec, family.draw, config.hyper)
+        self.learner, self.walks[i], report = run(self.grounds[i], self.learner, walk, key, lr,
+                                                  entropy)
         return report
 
     @cached_property

@@ -152,6 +152,22 @@ def test_training_learns(advantages):
     assert after["makespan_gap"] < before["makespan_gap"]
 
 
+def test_programs_compiled_side_by_side_train_to_the_same_bits():
+    """Ahead of time in threads, or one after the other as each is first called."""
+    config = dataclasses.replace(TINY, families=(*TINY.families, Practice("open", SMALL)))
+    ahead, called = MacroMappo(config), MacroMappo(config)
+    ahead.enter("macro")
+    assert sorted(ahead._programs) == [0, 1]
+    programs = dict(ahead._programs)
+    ahead.enter("macro")
+    assert ahead._programs == programs
+    figures = [trainee.chunk(Position("macro")).figures for trainee in (ahead, called)]
+    assert figures[0] == figures[1]
+    for one, other in zip(*(jax.tree.leaves(jax.device_get(checkpoints.raw(trainee.state())))
+                            for trainee in (ahead, called)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_held_out_optima_are_optima():
     held = HeldOut(Practice("small", SMALL), 12)
     for i in range(12):
