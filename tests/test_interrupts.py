@@ -79,6 +79,19 @@ def test_where_something_is_done_a_line_comes_at_once_and_the_program_is_waited_
     assert err.endswith("moonteam: interrupted\n")
 
 
+def test_what_is_saved_stands_in_the_line_that_comes_at_once():
+    _, _, err, _ = run("interrupts.saved('update 7 is saved'); interrupts.hold(); "
+                       "compiled(3_000_000)", signal.SIGINT)
+    stopping, interrupted = err.splitlines()
+    assert stopping.startswith("moonteam: stopping; what runs is finished and saved, a second ")
+    assert stopping.endswith("; update 7 is saved")
+    assert interrupted == "moonteam: interrupted; update 7 is saved"
+    _, _, err, seconds = run(f"interrupts.saved('update 7 is saved'); compiled({ENDLESS - 1})",
+                             signal.SIGINT)
+    assert err == "moonteam: interrupted; update 7 is saved\n"
+    assert seconds < 1.0 + BUSY
+
+
 def test_a_second_signal_leaves_at_once():
     code, out, err, seconds = run(f"interrupts.hold(); compiled({ENDLESS - 1})", signal.SIGINT,
                                   signal.SIGINT)

@@ -45,6 +45,7 @@ class _State:
     number: int = signal.SIGINT  # the last
     sent: int = 0  # those of them that are our own
     held: bool = False  # work is done that is lost if the process leaves at once
+    saved: str = ""  # what is on the disk by now, in words
     said: bool = False  # that it was interrupted
     stop: Stop | None = None  # who is told instead of interrupted, while something is held
 
@@ -57,12 +58,21 @@ def hold() -> None:
     _now.held = True
 
 
+def saved(words: str) -> None:
+    """Tells what is on the disk by now, for the line that answers a signal; empty: nothing."""
+    _now.saved = words
+
+
 def say() -> int:
     """Says that the command was interrupted; returns the exit code."""
     _now.said = True
     with suppress(OSError):
-        print("moonteam: interrupted", file=sys.stderr, flush=True)
+        print(f"moonteam: interrupted{_and_saved(_now)}", file=sys.stderr, flush=True)
     return CODE
+
+
+def _and_saved(state: _State) -> str:
+    return f"; {state.saved}" if state.saved else ""
 
 
 def leave(code: int) -> NoReturn:
@@ -189,10 +199,11 @@ def _watch(reading: int, state: _State) -> None:
             continue
         heard = came - state.sent
         if heard == 1 and state.held:
-            _write("stopping; what runs is finished and saved, a second Ctrl-C leaves at once")
+            _write("stopping; what runs is finished and saved, a second Ctrl-C leaves at once"
+                   + _and_saved(state))
         else:
             time.sleep(_GRACE)
             if not state.said:
-                _write("interrupted")
+                _write(f"interrupted{_and_saved(state)}")
             os._exit(CODE)
     os.close(reading)

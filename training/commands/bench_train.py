@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -53,8 +54,8 @@ class Args(Reported):
     """Environments, if not the preset's; beside JaxMARL 256 if not given."""
     num_minibatches: int | None = None
     """Minibatches, if not the preset's or JaxMARL's."""
-    precision: str | None = None
-    """float32, tf32 or bfloat16, if not the preset's."""
+    precision: Literal["float32", "tf32", "bfloat16"] | None = None
+    """Of matrix products, if not the preset's."""
     updates: int = 2
     """Updates in one timed run beside JaxMARL."""
     repeats: int = 5

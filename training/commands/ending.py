@@ -25,16 +25,26 @@ class Watched(RunFolder, Printed):
     tensorboard: Aside[bool] = False
     """Write the metrics as TensorBoard events into the run folder too; needs
     pip install 'moonteam[tensorboard]'."""
+    wandb: Aside[bool] = False
+    """Hand the metrics to Weights & Biases too; needs pip install 'moonteam[wandb]'. With
+    WANDB_MODE=offline in the environment they stay in the run folder, for `wandb sync`."""
+    dry_run: Aside[bool] = False
+    """Print what would be trained, its numbers and files; train and compile nothing."""
 
     def folder(self, name: str, seed: int) -> Path:
         """That given, or the one that this run is known by.
 
-        Raises InputError if TensorBoard is asked for and missing, before anything is written.
+        Raises InputError if TensorBoard or Weights & Biases is asked for and missing, before
+        anything is written.
         """
         if self.tensorboard:
             from training.run.metrics import tensorboard_writer
 
             tensorboard_writer()
+        if self.wandb:
+            from training.run.metrics import wandb_module
+
+            wandb_module()
         return self.out or Path("runs") / f"{name}-{seed}"
 
     def holding(self, out: Path) -> AbstractContextManager[None]:
@@ -83,8 +93,8 @@ def complete(run: Run, json: bool) -> int:
             finished = run.train(stop)
     except KeyboardInterrupt:
         following = run.position.total_updates + 1
-        print(f"moonteam: interrupted before {run.trainee.unit} {following} was done; go on with "
-              f"--out {run.out} --resume", file=sys.stderr)
+        print(f"moonteam: interrupted before {run.trainee.unit} {following} was done; {run.kept}; "
+              f"go on with --out {run.out} --resume", file=sys.stderr)
         return interrupts.CODE
     except Diverged as error:
         print(f"moonteam: {error}", file=sys.stderr)

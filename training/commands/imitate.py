@@ -15,6 +15,7 @@ from moonteam.policies.brain import EntityBrain
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.policy import Policy
 from moonteam.report.progress import say
+from training.commands import dry
 from training.commands.ending import Taught, complete
 from training.run.machine import Run
 from training.sharding import use_all_cores
@@ -61,12 +62,17 @@ def run(args: Args) -> int:
     spec, params = entity_policy(args.begin) if args.begin else (preset.spec, None)
     config = dataclasses.replace(preset, seed=args.seed, rounds=rounds, lr=lr, spec=spec)
     out = args.folder(f"imitate-{args.preset}", args.seed)
+    if args.dry_run:
+        return dry.show(*dry.taught(
+            f"moonteam train imitate {args.preset}", config, args.begin,
+            f"{config.batches} batches of {config.batch_size} states a family and round"),
+            out, args.json)
     use_all_cores()
     with args.holding(out):
         say("moonteam: making grounds and held-out scenarios, compiling")
         dagger = Dagger(config, params, args.preset, args.begin)
         run = Run(dagger, out, args.resume, args.checkpoint_seconds,
-                  tensorboard=args.tensorboard, force=args.force)
+                  tensorboard=args.tensorboard, force=args.force, wandb=args.wandb)
         return complete(run, args.json)
 
 

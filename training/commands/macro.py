@@ -17,6 +17,7 @@ from moonteam.commands.options import Apart
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.progress import say
+from training.commands import dry
 from training.commands.ending import Together, Watched, complete, ended, interrupted
 from training.mappo.macro import config as configs
 from training.mappo.macro.config import MacroConfig
@@ -35,6 +36,7 @@ class Args(Together, Apart, Watched):
 
     Examples:
       moonteam train quick
+      moonteam train any_team --dry-run
       moonteam train paper_team --seed 1 --out runs/team-1
       moonteam train paper_team --seeds 0 1 2 --out runs/team
       moonteam train paper_team --seeds 0 1 2 --out runs/team --on ray://head:10001
@@ -62,9 +64,12 @@ def run(args: Args) -> int:
     """Trains; returns the exit code."""
     if len(set(args.seeds)) < len(args.seeds):
         raise InputError("--seeds", f"{' '.join(map(str, args.seeds))}: a seed is given twice")
-    for option, given in (("--coordinator", args.coordinator), ("--tensorboard", args.tensorboard)):
+    for option, given in (("--coordinator", args.coordinator), ("--tensorboard", args.tensorboard),
+                          ("--wandb", args.wandb)):
         if args.on and given:
             raise InputError(option, "is for runs in this process, not for those --on a cluster")
+    if args.dry_run:
+        return _dry(args)
     if not args.seeds:
         return _train_each(args, [args])
     from training.commands import compare
@@ -78,6 +83,17 @@ def run(args: Args) -> int:
         return _train_each(args, runs)
     with outputs.folder(base, compare.FILES, force=args.force, resume=args.resume):
         return _train_each(args, runs) or compare.run(compare.Args(tuple(outs), out=base))
+
+
+def _dry(args: Args) -> int:
+    config, _, source = _numbers(args)
+    document, text = dry.macro(config, source)
+    out = args.folder(config.macro, (args.seeds or (config.seed,))[0])
+    if args.seeds:
+        out = (args.out or out.parent / config.macro) / "SEED"
+        text += f"\nseeds: {' '.join(map(str, args.seeds))}, each the same"
+        document["seeds"] = list(args.seeds)
+    return dry.show(document, text, out, args.json)
 
 
 def _train_each(args: Args, runs: list[Args]) -> int:
@@ -96,7 +112,8 @@ def _train(args: Args) -> int:
     with args.holding(out):
         say("moonteam: making grounds and held-out problems, compiling")
         return complete(Run(MacroMappo(*numbers), out, args.resume, args.checkpoint_seconds,
-                            tensorboard=args.tensorboard, force=args.force), args.json)
+                            tensorboard=args.tensorboard, force=args.force,
+                            wandb=args.wandb and not args.process), args.json)
 
 
 def _train_apart(on: str, runs: list[Args]) -> int:

@@ -13,6 +13,7 @@ from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.policies.entity import EntitySpec, init
 from moonteam.report.progress import say
+from training.commands import dry
 from training.commands.ending import Taught, complete
 from training.commands.imitate import entity_policy
 from training.run import metrics
@@ -75,11 +76,17 @@ def run(args: Args) -> int:
         rounds=args.rounds, lr=args.lr, leash=args.leash, ent_coef=args.ent_coef,
         seed=args.seed)
     out = args.folder("refine", args.seed)
+    if args.dry_run:
+        return dry.show(*dry.taught(
+            f"moonteam train refine {args.policy}", config,
+            "" if args.policy == FRESH else args.policy,
+            f"reward {config.reward}, leash {config.leash:g}, entropy {config.ent_coef:g}, "
+            f"{config.minibatches} minibatches a family and round"), out, args.json)
     with args.holding(out):
         say("moonteam: making grounds and held-out scenarios, compiling")
         refiner = Refiner(config, params, source="" if args.policy == FRESH else args.policy)
         run = Run(refiner, out, args.resume, args.checkpoint_seconds,
-                  tensorboard=args.tensorboard, force=args.force)
+                  tensorboard=args.tensorboard, force=args.force, wandb=args.wandb)
         code = complete(run, args.json)
         if others and code == 0:
             draw_curve(out / "beside.png", {str(out): run.metrics.rows} | others)

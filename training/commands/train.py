@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from moonteam import files
 from moonteam.commands.options import parse as parse_words
 from moonteam.errors import InputError
 from moonteam.report.command import Aside
+from training.commands import dry
 from training.commands.ending import Together, Watched, complete
 from training.mappo import config as configs
 from training.mappo.config import Config
@@ -65,8 +65,6 @@ class Args(Together, Watched):
     stop_on_collapse: bool = True
     """Stop, with exit code 1, when held-out success has fallen to half of its best for three
     evaluations in a row."""
-    dry_run: Aside[bool] = False
-    """Print the numbers, totals, memory and work, train nothing."""
     compiled: Aside[bool] = False
     """With --dry-run: also compile both phases, without running them, and print what memory XLA
     sets aside for them."""
@@ -85,7 +83,7 @@ def parse(words: list[str]) -> Any:
     if not named and not asks_help:
         configs.preset("" if not words else words[0], NAMES)
     name, rest = (words[0], words[1:]) if named else ("small", words)
-    default = Args(configs.preset(name, NAMES))
+    default = Args(configs.preset(name, NAMES, ELSEWHERE))
     return parse_words(Args, f"train {name if named else 'PRESET'}", rest, default)
 
 
@@ -96,21 +94,29 @@ def run(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> 
     enable_cache()
     if not isinstance(args, Args):
         return importlib.import_module(type(args).__module__).run(args)
+    if args.compiled and not args.dry_run:
+        raise InputError("--compiled", "is for --dry-run")
     if args.dry_run:
         from training.bench import account
 
-        table = account.describe(args.config, args.compiled)
-        print(files.dump_json(table, 2) if args.json else account.as_text(args.config, table))
-        return 0
+        document = account.describe(args.config, args.compiled)
+        return dry.show(document, account.as_text(args.config, document), _place(args), args.json)
     return _train(args)
 
 
 def folder(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> Path:
     """The run folder of a training. Raises InputError for a command that trains nothing."""
-    from training.commands import compare, macro, refine
+    from training.commands import compare
 
-    if isinstance(args, compare.Args) or (isinstance(args, Args) and args.dry_run):
+    if isinstance(args, compare.Args) or args.dry_run:
         raise InputError("train", "trains nothing so, and has no run folder")
+    return _place(args)
+
+
+def _place(args: Args | imitate.Args | macro.Args | refine.Args) -> Path:
+    """The run folder."""
+    from training.commands import macro, refine
+
     if isinstance(args, Args):
         return args.folder(args.config.name, args.config.seed)
     if isinstance(args, macro.Args):
@@ -127,5 +133,5 @@ def _train(args: Args) -> int:
     args.join()
     with args.holding(out):
         return complete(Run(Mappo(args.config), out, args.resume, args.checkpoint_seconds,
-                            args.stop_on_collapse, args.tensorboard, args.begin, args.force),
-                        args.json)
+                            args.stop_on_collapse, args.tensorboard, args.begin, args.force,
+                            args.wandb and not args.process), args.json)

@@ -18,7 +18,7 @@ import jax
 import msgspec
 import numpy as np
 
-from moonteam import files, interrupts, outputs
+from moonteam import compilation, files, interrupts, outputs
 from moonteam.errors import InputError
 from moonteam.interrupts import Stop
 from moonteam.policies.policy_file import save_policy
@@ -31,7 +31,8 @@ from training.run.trainee import Position, Row, Trainee
 from training.sharding import anywhere, describe_device, gather
 
 FILES = ("config.json", "metrics.jsonl", "checkpoints", "policy.safetensors", "report.json",
-         "curve.png", "beside.png", "events.out.tfevents.*")
+         "curve.png", "beside.png", "events.out.tfevents.*",
+         "wandb")
 """Of a run folder."""
 
 
@@ -50,9 +51,10 @@ class Run:
 
     def __init__(self, trainee: Trainee, out: Path, resume: bool,
                  checkpoint_seconds: float = 30.0, stop_on_collapse: bool = True,
-                 tensorboard: bool = False, begin: Path | None = None, force: bool = False):
+                 tensorboard: bool = False, begin: Path | None = None, force: bool = False,
+                 wandb: bool = False):
         """`begin`: a checkpoint of another run, to go on from with this one's numbers. `force`: an
-        earlier run in the folder is removed.
+        earlier run in the folder is removed. `tensorboard`, `wandb`: the metrics go there too.
 
         Raises InputError if the folder holds a run that this one may not go on with, or `begin`
         is no checkpoint that it could begin with.
@@ -69,12 +71,20 @@ class Run:
         if force:
             outputs.clear(out, FILES)
         self.metrics = Metrics(out / "metrics.jsonl", self.position.total_updates, tensorboard,
-                               begin and begin.parent.parent / "metrics.jsonl")
+                               begin and begin.parent.parent / "metrics.jsonl",
+                               trainee.recipe if wandb else None)
         self.last_saved, self.saved = time.monotonic(), self.position.total_updates
         self.last_good = checkpoints.newest(self.folder)
         if begin is not None:
             self.save()
         files.write_json(out / "config.json", trainee.recipe)
+
+    @property
+    def kept(self) -> str:
+        """What is on the disk, in words."""
+        if self.last_good is None:
+            return "no checkpoint is saved yet"
+        return f"{self.trainee.unit} {self.saved} is saved, {self.last_good}"
 
     def _find(self, resume: bool, force: bool) -> Position:
         self._check_folder(resume, force)
@@ -143,6 +153,7 @@ class Run:
         `stop_after` is a number of updates over all phases, for tests and trials.
         """
         trainee, position = self.trainee, self.position
+        interrupts.saved(self.kept)
         try:
             with bar(trainee.name, trainee.env_steps, position.env_steps) as show:
                 show(position.env_steps, "compiling")
@@ -152,6 +163,7 @@ class Run:
                 self.save()
             return done
         finally:
+            interrupts.saved("")
             self.metrics.close()
 
     def _train_phase(self, phase: str, updates: int, stop: Stop, stop_after: int | None,
@@ -181,9 +193,9 @@ class Run:
     def _chunk(self) -> Row:
         """Makes, checks and records the next updates."""
         trainee, position = self.trainee, self.position
-        begun = time.monotonic()
+        begun = compilation.working_time()
         made = trainee.chunk(position)
-        seconds = time.monotonic() - begun
+        seconds = max(compilation.working_time() - begun, 1e-9)
         self._check_finite(made.figures)
         position.update += made.updates
         position.total_updates += made.updates
@@ -235,6 +247,7 @@ class Run:
         self.last_good = checkpoints.save(self.folder, gather(checkpoints.raw(trainee.state())),
                                           about, keep)
         self.last_saved, self.saved = time.monotonic(), self.position.total_updates
+        interrupts.saved(self.kept)
 
     def finish(self) -> dict[str, Any]:
         """Writes policy, curve and report of a run that reached its end; returns the report."""

@@ -1,32 +1,40 @@
-"""What a run writes down while it goes: `metrics.jsonl`, and TensorBoard's events if asked."""
+"""What a run writes down while it goes: `metrics.jsonl`, and where else it is asked to.
+
+TensorBoard's events, and a run of Weights & Biases, which is kept in the run folder where
+WANDB_MODE is offline: that needs neither network nor account, and `wandb sync` hands it in later.
+"""
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from moonteam import files
+from moonteam import files, interrupts
 from moonteam.errors import InputError
 from training.run.trainee import Row
 
 
 class Metrics:
-    """Appends one JSON object a chunk to `metrics.jsonl`, and its numbers to TensorBoard's events.
+    """Appends one JSON object a chunk to `metrics.jsonl`, and its numbers to what else there is.
 
     `close` at the end.
     """
 
     def __init__(self, path: Path, resumed_updates: int, tensorboard: bool = False,
-                 earlier: Path | None = None):
+                 earlier: Path | None = None, recipe: dict[str, Any] | None = None):
         """Keeps the lines of an earlier stretch up to `resumed_updates`, drops later ones.
 
-        `earlier`: where that stretch is, if in another file.
-        Raises InputError if TensorBoard is asked for and its writer is not installed.
+        `earlier`: where that stretch is, if in another file. `recipe`: the run's numbers, for
+        Weights & Biases, which is used where it is given.
+        Raises InputError if something is asked for whose writer is not installed.
         """
         writer = tensorboard_writer() if tensorboard else None
         self.path, self.events = path, None
+        self.biases = None if recipe is None else _begun(path.parent, recipe)
         self.rows = [row for row in read(earlier or path)
                      if row["total_updates"] <= resumed_updates]
         files.write_text(path, "".join(files.dump_json(row) + "\n" for row in self.rows))
@@ -43,11 +51,16 @@ class Metrics:
             for name, value in scalars(row).items():
                 self.events.add_scalar(name, value, row["env_steps"])
             self.events.flush()
+        if self.biases:
+            self.biases.log(scalars(row))
 
     def close(self) -> None:
         """Nothing is added after this."""
         if self.events:
             self.events.close()
+        if self.biases:
+            with interrupts.kept():
+                self.biases.finish()
 
 
 def tensorboard_writer() -> Any:
@@ -58,6 +71,36 @@ def tensorboard_writer() -> Any:
         raise InputError("--tensorboard", "needs tensorboardX, which is not installed: "
                          "pip install 'moonteam[tensorboard]'") from None
     return SummaryWriter
+
+
+def wandb_module() -> Any:
+    """Weights & Biases. Raises InputError if it is not installed."""
+    try:
+        return importlib.import_module("wandb")
+    except ImportError:
+        raise InputError("--wandb", "needs wandb, which is not installed: pip install "
+                         "'moonteam[wandb]'") from None
+
+
+def _begun(out: Path, recipe: dict[str, Any]) -> Any:
+    """A run of Weights & Biases: that of an earlier stretch in the folder goes on.
+
+    Its figures stand over `env_steps`, not over its own counter: what is trained anew after a
+    resume is written anew. Raises InputError where it cannot begin.
+    """
+    wandb = wandb_module()
+    earlier = sorted((out / "wandb").glob("*run-*-*"))
+    with interrupts.kept():
+        try:
+            run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "moonteam"), name=out.name, dir=str(out),
+                config=recipe, id=earlier[-1].name.rpartition("-")[2] if earlier else None,
+                resume="allow", settings=wandb.Settings(silent=True, console="off"))
+        except (wandb.Error, OSError) as error:
+            raise InputError("--wandb", f"cannot begin: {str(error).splitlines()[0]}; "
+                             "WANDB_MODE=offline needs neither network nor account") from None
+    run.define_metric("*", step_metric="env_steps")
+    return run
 
 
 def scalars(row: dict[Any, Any], prefix: str = "") -> dict[str, float]:

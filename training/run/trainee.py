@@ -24,7 +24,7 @@ class Position:
     env_steps: int = 0
     """Steps of environments so far; each moves a whole team once."""
     seconds: float = 0.0
-    """Spent in chunks, evaluations apart."""
+    """Spent in chunks; evaluations and compiling apart."""
 
 
 class Made(NamedTuple):

@@ -61,6 +61,28 @@ def test_dry_run_as_a_table(capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("words", "decisions"), [
+    ("quick", 90 * 2048), ("paper_team", 600 * 2048), ("any_team --rounds 10", None),
+    ("quick --seeds 0 1 --families.0.advantages critic --num-envs 64", 90 * 64 * 16),
+    ("any_team --policy any_team_mappo", None),
+    ("imitate quick", 900 * 3 * 256 * 6), ("imitate any_team", None),
+    ("refine fresh --families quick", 300 * 3 * 128 * 16), ("refine any_team_imitated", None),
+    *((name, None) for name in PRESETS)])
+def test_every_preset_has_a_dry_run(words, decisions, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    table = dry_run(capsys, *words.split())
+    assert table["env_steps"] == decisions or decisions is None
+    assert table["env_steps"] > 0
+    assert table["parameters"] > 1000
+    assert table["out"].startswith("runs/")
+    assert {"policy.safetensors", "report.json"} <= set(table["files"])
+    assert main(["train", *words.split(), "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert f"run folder: {table['out']}" in text
+    assert f"{table['env_steps']:,}" in text
+    assert not list(tmp_path.iterdir())
+
+
 def test_options_change_the_preset(capsys):
     table = dry_run(capsys, "small", "--seed", "4", "--bootstrap.updates", "7")
     assert (table["config"]["seed"], table["config"]["bootstrap"]["updates"]) == (4, 7)
@@ -68,7 +90,9 @@ def test_options_change_the_preset(capsys):
 
 @pytest.mark.parametrize(("words", "line"), [
     (["nosuch"], "nosuch: no such preset; one of: quick,"),
-    ([], "no such preset"),
+    ([], "moonteam train: a preset must be given; one of: quick,"),
+    (["qick"], "qick: no such preset; did you mean quick? one of: quick,"),
+    (["comprae"], "comprae: no such preset; did you mean compare?"),
     (["small", "--bootstrap.num-minibatches", "7"],
      "bootstrap.num_minibatches: 512 environments do not divide into 7 minibatches"),
     (["small", "--num-steps", "49"], "num_steps: 49 is more than max_steps 48"),

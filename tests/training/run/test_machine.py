@@ -24,6 +24,7 @@ from training.mappo.config import BOOTSTRAP, REFINEMENT, Config, Phase
 from training.mappo.trainee import Mappo
 from training.run import checkpoints, machine, metrics
 from training.run.machine import Run
+from training.run.trainee import Made
 
 TINY = Config(
     "small", Phase(4, 8, 2, BOOTSTRAP), Phase(6, 8, 2, REFINEMENT), num_agents=2, num_targets=2,
@@ -77,6 +78,33 @@ def test_resumed_twice_is_bit_identical(whole, tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["total_updates"] for row in rows] == [2, 4, 6, 8, 10]
     assert {"argmax", "sample", "success", "makespan", "rate"} <= rows[1].keys()
+
+
+def test_a_run_says_what_is_saved(tmp_path, whole):
+    run = Run(Mappo(TINY), tmp_path, resume=False)
+    assert run.kept == "no checkpoint is saved yet"
+    at = whole.out / "checkpoints" / "00000010"
+    assert whole.kept == f"update 10 is saved, {at}"
+
+
+def test_the_first_rate_leaves_compiling_out(tmp_path, monkeypatch):
+    """Whatever a chunk compiles, its rate is that of the work."""
+    def chunk(at):
+        def heavy(x):
+            for _ in range(1000):
+                x = jax.numpy.sin(x) + 1
+            return x
+
+        jax.jit(heavy).lower(np.zeros(3))
+        return Made(2, 128, {"loss": 0.0})
+
+    run = Run(Mappo(TINY), tmp_path, resume=False)
+    run.trainee.enter("bootstrap")
+    monkeypatch.setattr(run.trainee, "chunk", chunk)
+    begun = time.perf_counter()
+    row = run._chunk()
+    assert row["seconds"] < (time.perf_counter() - begun) / 2
+    assert row["rate"] == pytest.approx(row["env_steps"] / row["seconds"])
 
 
 def test_another_seed_is_another_run(whole, tmp_path):

@@ -2,6 +2,7 @@
 
 import struct
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -70,6 +71,80 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path, monkeypatch
     with pytest.raises(InputError, match="is not installed"):
         metrics.Metrics(tmp_path / "metrics.jsonl", 0, tensorboard=True)
     metrics.Metrics(tmp_path / "metrics.jsonl", 0).add(row(1))
+
+
+class Biases:
+    """Stands in for Weights & Biases: takes down what is called."""
+
+    Error = RuntimeError
+
+    def __init__(self, fails=""):
+        self.calls, self._fails = [], fails
+
+    def Settings(self, **given):
+        return given
+
+    def init(self, **given):
+        if self._fails:
+            raise self.Error(self._fails)
+        self.calls.append(("init", given))
+        return SimpleNamespace(
+            define_metric=lambda *a, **k: self.calls.append(("define_metric", a, k)),
+            log=lambda row: self.calls.append(("log", row)),
+            finish=lambda: self.calls.append(("finish",)))
+
+
+def test_weights_and_biases_gets_every_number_of_every_row(tmp_path, monkeypatch):
+    biases = Biases()
+    monkeypatch.setitem(sys.modules, "wandb", biases)
+    written = metrics.Metrics(tmp_path / "metrics.jsonl", 0, recipe={"seed": 3})
+    written.add(row(1, sample=SCORE))
+    written.close()
+    (_, begun), over, logged, end = biases.calls
+    assert begun["config"] == {"seed": 3}
+    assert (begun["dir"], begun["name"], begun["id"]) == (str(tmp_path), tmp_path.name, None)
+    assert over == ("define_metric", ("*",), {"step_metric": "env_steps"})
+    assert logged == ("log", metrics.scalars(row(1, sample=SCORE)))
+    assert logged[1]["sample/makespan"] == 14.25
+    assert end == ("finish",)
+
+
+def test_a_resumed_run_of_weights_and_biases_is_the_same(tmp_path, monkeypatch):
+    biases = Biases()
+    monkeypatch.setitem(sys.modules, "wandb", biases)
+    for name in ("offline-run-20260101_000000-first", "run-20260102_000000-abc123"):
+        (tmp_path / "wandb" / name).mkdir(parents=True)
+    metrics.Metrics(tmp_path / "metrics.jsonl", 0, recipe={}).close()
+    assert biases.calls[0][1]["id"] == "abc123"
+    assert biases.calls[0][1]["resume"] == "allow"
+
+
+def test_where_weights_and_biases_cannot_be_one_line_says_so(tmp_path, monkeypatch, capsys):
+    words = ["train", "small", "--wandb", "--out", str(tmp_path / "run")]
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert main(words) == 2
+    assert "pip install 'moonteam[wandb]'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setitem(sys.modules, "wandb", Biases("api_key not configured (no-tty)\nmore"))
+    with pytest.raises(InputError, match=r"api_key not configured.*WANDB_MODE=offline"):
+        metrics.Metrics(tmp_path / "metrics.jsonl", 0, recipe={})
+
+
+def test_weights_and_biases_offline_needs_no_account(tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    written = metrics.Metrics(tmp_path / "metrics.jsonl", 0, recipe={"seed": 3})
+    written.add(row(1))
+    written.close()
+    (run,) = (tmp_path / "wandb").glob("offline-run-*")
+    (log,) = run.glob("run-*.wandb")
+    assert log.stat().st_size > 100
+    again = metrics.Metrics(tmp_path / "metrics.jsonl", 1, recipe={"seed": 3})
+    again.add(row(2))
+    again.close()
+    names = [one.name.rpartition("-")[2] for one in (tmp_path / "wandb").glob("offline-run-*")]
+    assert len(names) == 2
+    assert len(set(names)) == 1
 
 
 def test_scores_of_a_list_are_numbered():
