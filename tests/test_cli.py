@@ -65,6 +65,7 @@ def test_a_group_lists_its_commands(group, capsys):
     ("check robot weeled", "did you mean wheeled?"),
     ("check planner exat", "did you mean exact?"),
     ("evaluate grid 3x55", "did you mean 3x5?"),
+    ("evaluate grid 3x5 --decode argmx", "--decode: 'argmx' is not one of argmax, "),
     ("export any_tem --out x.onnx", "did you mean any_team?"),
     ("evaluate execution --site mar", "did you mean mare?")])
 def test_a_name_that_is_nearly_right_is_said(words, line, capsys, tmp_path, monkeypatch):

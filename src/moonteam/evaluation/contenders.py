@@ -236,6 +236,8 @@ def contenders(options: Options) -> list[Contender]:
         options.of(limit=limit)
     for preference in options.preferences:
         options.of(preference=preference)
+    for text in options.decodes:
+        decoding.parse(text)
     found: list[Contender] = []
     for planner in dict.fromkeys(options.planners):
         kind = registry.find(planner)
