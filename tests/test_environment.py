@@ -77,6 +77,14 @@ def test_what_lets_nothing_run_is_named(name, value, words, line):
     assert "Traceback" not in done.stderr
 
 
+def test_doctor_writes_what_it_prints(tmp_path):
+    done = moonteam("doctor", "--licences", "--json", "--out", str(tmp_path / "out"))
+    assert done.returncode == 0
+    (file,) = (tmp_path / "out").iterdir()
+    assert file.name == "doctor.json"
+    assert json.loads(file.read_text()) == json.loads(done.stdout)
+
+
 def test_doctor_says_that_there_is_no_such_device():
     done = moonteam("doctor", JAX_PLATFORMS="cuda")
     assert done.returncode == 0, done.stderr

@@ -10,8 +10,10 @@ import sys
 from dataclasses import dataclass
 
 from moonteam import compilation, files, paths
-from moonteam.commands.options import Printed
+from moonteam.commands.options import Printed, Saved
 
+FILES = ("doctor.json",)
+"""In --out."""
 PACKAGES = ("jax", "flax", "mujoco", "mujoco-mjx", "terraingenpy", "rasterio", "numba", "ortools")
 
 RENDER_PROBE = """
@@ -31,12 +33,15 @@ os._exit(not drawn)
 
 
 @dataclass(frozen=True)
-class Args(Printed):
+class Args(Saved, Printed):
     """Say what this machine can do: JAX devices, headless rendering, video, extras.
+
+    Files in --out: doctor.json, which is what --json prints.
 
     Examples:
       moonteam doctor
       moonteam doctor --json
+      moonteam doctor --out runs/doctor
       moonteam doctor --licences
     """
 
@@ -92,8 +97,9 @@ def examine() -> dict:
 def run(args: Args) -> int:
     """Prints the findings; always 0, since missing extras are no failure."""
     if args.licences:
-        return _print_licences(args.json)
+        return _print_licences(args)
     found = examine()
+    _save(args, found)
     if args.json:
         print(files.dump_json(found))
         return 0
@@ -117,11 +123,17 @@ def run(args: Args) -> int:
     return 0
 
 
-def _print_licences(as_json: bool) -> int:
+def _save(args: Args, found: object) -> None:
+    if args.out is not None:
+        files.write_json(args.out / FILES[0], found)
+
+
+def _print_licences(args: Args) -> int:
     from moonteam.report import licences
 
     found = licences.packages()
-    if as_json:
+    _save(args, [one._asdict() for one in found])
+    if args.json:
         print(files.dump_json([one._asdict() for one in found]))
         return 0
     wide = max(len(f"{one.name} {one.version}") for one in found)
