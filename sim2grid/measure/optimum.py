@@ -69,7 +69,8 @@ def words(found: Optimum) -> str:
                 f"{max(over, 0.0):.1%} over")
     over = found.plan_steps / found.optimum_steps - 1
     return (f"plan {found.plan_steps} steps ({found.plan_s:.1f} s at travelling speed), certified "
-            f"optimum {found.optimum_steps} steps ({found.optimum_s:.1f} s): {over:.1%} over")
+            f"optimum {found.optimum_steps} steps ({found.optimum_s:.1f} s): {over:.1%} over in "
+            "steps")
 
 
 def _seconds(actions: npt.NDArray[np.int32], bodies: Sequence[Body], cell_m: float) -> float:

@@ -147,6 +147,8 @@ def test_real_robots_do_it_as_planned(tiny, capsys, tmp_path):
     assert report["success"]
     assert report["mode"] == "clock"
     assert report["expected_s"] == pytest.approx(plan["makespan"], abs=6)  # ways home beside it
+    assert report["optimum"]["plan_s"] == report["optimum"]["optimum_s"] == pytest.approx(
+        plan["makespan"], abs=0.5)  # from the poses on the ground, not from the cells' centres
     assert report["seconds"] == pytest.approx(plan["makespan"], rel=0.35)
     hopper, rover = report["robots"]
     assert hopper["service_s"] + rover["service_s"] == 3
