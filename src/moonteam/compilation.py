@@ -103,9 +103,9 @@ def _hear() -> None:
         event.register("numba:compile", OfNumba())
 
 
-def _of_jax(event: str, seconds: float, **_: Any) -> None:
+def _of_jax(event: str, duration_secs: float, **kwargs: str | int) -> None:
     if event.startswith("/jax/core/compile/"):
-        _compiling.add(seconds)
+        _compiling.add(duration_secs)
 
 
 def keep_freed_memory() -> None:

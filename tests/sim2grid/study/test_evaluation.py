@@ -16,7 +16,6 @@ import pytest
 from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.planners.kind import PlannerOptions
-from moonteam.report.intervals import wilson
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.study import evaluation
 from sim2grid.study.evaluation import Contender, Evaluation, Row, contenders
