@@ -159,11 +159,11 @@ def test_what_is_evaluated_comes_in_flat_rows():
     for row in (*report.rows, *report.summary):
         assert all(isinstance(v, (str, int, float, bool, type(None))) for v in row.values())
     best = report.summary[1]
-    assert best["planner"] == "exact"
+    assert best["planner"] == "exact(makespan)"
     assert best["intervals.makespan.0"] <= best["makespan"] <= best["intervals.makespan.1"]
-    assert "<td>exact</td>" in report._repr_html_()
+    assert "<td>exact(makespan)</td>" in report._repr_html_()
     table = pytest.importorskip("pandas").DataFrame(report.rows)
-    assert table.groupby("planner").makespan.mean()["exact"] == best["makespan"]
+    assert table.groupby("planner").makespan.mean()["exact(makespan)"] == best["makespan"]
     assert report.to_pandas().equals(table)
 
 

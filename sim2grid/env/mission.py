@@ -89,7 +89,7 @@ class MoonMission(Face):
     def __init__(self, mission: Named | Sequence[Named] = "sampling", *, backend: str = "native",
                  max_decisions: int = 128, unit_s: float = 60.0, spaces: Spaces | None = None,
                  world_state: bool = False):
-        compilation.call_at_once()  # programs of the CPU must not wait for the one that calls back
+        compilation.call_at_once()  # the engine calls its controllers a hundred times a second
         if max_decisions < 1 or not unit_s > 0:
             raise InputError("MoonMission", "max_decisions and unit_s must be above 0")
         single = isinstance(mission, (str, os.PathLike, Mission))
