@@ -18,7 +18,7 @@ from moonteam.results import Rollout, Training
 from moonteam.robots import KINDS
 
 TOP = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/python.md", "docs/api/grid.md", "docs/own/planner.md")
+PAGES = ("README.md", "docs/python.md", "docs/api/grid.md", "docs/planners.md")
 
 
 @pytest.fixture(autouse=True)

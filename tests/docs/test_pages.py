@@ -102,7 +102,7 @@ def test_every_page_of_results_is_in_the_index():
 COMMANDS = [
     pytest.param(line, id=f"{page}-{number}")
     for page in ("README.md", "docs/quickstart.md", "docs/jobs.md", "docs/own/robot.md",
-                 "docs/own/planner.md", "docs/own/ground.md")
+                 "docs/planners.md", "docs/own/ground.md")
     for block in re.findall(r"```sh\n(.*?)```", (TOP / page).read_text(encoding="utf-8"), re.DOTALL)
     for number, line in enumerate(re.findall(r"(?m)^moonteam [^-].*$", block))]
 
