@@ -31,18 +31,20 @@ class Keeper:
     def __init__(self, planner: TimedPlanner, margin_ms: int = MARGIN_MS):
         self.name = planner.name
         self.plan: TimedPlan | None = None
+        self.first: TimedPlan | None = None  # of the mission, before anything went otherwise
         self._planner, self._margin = planner, margin_ms
         self._order: list[tuple[int, tuple[int, ...]]] = []
 
     def reset(self, moment: Moment, seed: int = 0) -> None:
         """Starts a mission."""
         del moment, seed
-        self._order, self.plan = [], None
+        self._order, self.plan, self.first = [], None, None
 
     def act(self, moment: Moment) -> npt.NDArray[np.int64]:
         """[R] what each robot goes for now: a target's number, HOME or WAIT."""
         kept = timed_again(moment, self._order)
         self.plan = self._planner.plan(moment)
+        self.first = self.first or self.plan
         better = self.plan.status != "infeasible" and (
             kept is None or makespan(moment, self.plan.services)
             < makespan(moment, kept) - self._margin)

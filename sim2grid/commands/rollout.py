@@ -27,19 +27,50 @@ from moonteam.version import __version__
 
 if TYPE_CHECKING:
     from moonteam.planners.base import Planner
+    from moonteam.planners.simulate import Trace
     from sim2grid.clock.execution import TimedExecution
     from sim2grid.loop.execution import Execution
     from sim2grid.loop.prepare import Prepared
     from sim2grid.measure.metrics import GridPlan, Optimum, Report
     from sim2grid.show.film import Film
+    from sim2grid.show.studio import Shooting
+    from sim2grid.show.take import Style, Take
 
-FILES = ("report.html", "video.mp4", "map.mp4", "paths.png", "report.json", "timing.json",
+FILES = ("report.html", "video.mp4", "video.webp", "video.gif", "map.mp4", "map.webp", "map.gif",
+         "paths.png", "report.json", "timing.json",
          "config.json")
 """In --out."""
+PLAIN_S = 10.0
+"""Between two lines on how far it is, where standard error is no terminal."""
 
 
 @dataclass(frozen=True)
-class Args(Planning, Forced, Printed):
+class Filmed:
+    """How the film is made."""
+
+    size: Aside[tuple[int, int]] = (1280, 720)
+    """Width and height of the film, pixels, both even."""
+    fps: Aside[float] = 30.0
+    """Pictures a second."""
+    seconds: Aside[float] = 24.0
+    """Length of the film, title and end included; shorter where the mission is."""
+    speed: Aside[float | None] = None
+    """How fast wide pictures run, close ones being at true speed; the film is as long as that
+    takes. Default: as --seconds asks for."""
+    camera: Aside[str] = "auto"
+    """auto cuts from wide pictures to whatever happens; wide, chase, or the name of a robot: one
+    camera all the time, which goes along with it."""
+    shadows: Aside[bool] = True
+    """Robots cast shadows."""
+    layout: Aside[Literal["inset", "clean", "map"]] = "inset"
+    """inset: the map and the lists lie over the picture; clean: names alone; map: no 3-D picture,
+    the map fills the film."""
+    also: Aside[tuple[Literal["webp", "gif"], ...]] = ()
+    """The film once more, small, for a README."""
+
+
+@dataclass(frozen=True)
+class Args(Filmed, Planning, Forced, Printed):
     """Run a mission in physics: a video, a map of the paths and a report.
 
     The planner decides on the grid; every move becomes a waypoint that a simulated robot has to
@@ -47,14 +78,15 @@ class Args(Planning, Forced, Printed):
     Exit code 0 if every target was solved, 1 if the mission failed.
 
     Files in the output folder: report.html (all of it on one page), video.mp4 (map.mp4 where no
-    3-D pictures can be made), paths.png, report.json (the same for the same seed), timing.json
-    (wall-clock times), config.json.
+    3-D pictures can be made, or wanted; .webp and .gif with --also), paths.png, report.json (the
+    same for the same seed), timing.json (wall-clock times), config.json.
 
     Examples:
       moonteam rollout demo
       moonteam rollout outpost --planner exact --backend native --out runs/exact
       moonteam rollout my_mission.yaml --planner exact --no-video --json
       moonteam rollout demo --planner exact --backend native --viewer
+      moonteam rollout demo --camera strider --seconds 12 --size 854 480 --also webp
       moonteam rollout --from runs/execution/report.json --mission 17
     """
 
@@ -110,6 +142,7 @@ class Run:
     width: int = 1  # rows of the engine
     row: int = 0  # the one that is used
     before: Report | None = None  # what came of it when it was run first
+    trace: Trace | None = None  # of the plan on the grid, None by the clock
     why: str = "as the report has it"  # this engine
     best: Callable[[], Optimum | None] = lambda: None  # the optimum beside the plan, asked late
 
@@ -156,16 +189,19 @@ def carry_out(args: Args) -> Done:
 
         check_display()
     made = _from_file(args) if args.report is None else _from_report(args)
+    _check_camera(args, made.prepared.mission)
     out = folder(made.prepared.mission.name, args.out, args.force)
     with outputs.folder(out, FILES, force=args.force):
         return _carry_out(args, made, out)
 
 
-def film(made: Run, path: Path) -> None:
-    """The film of a mission that was run, as one file; see `_save_video`."""
+def film(made: Run, best: Optimum | None, path: Path) -> None:
+    """The film of a mission that was run, as one file; `best` stands on its last card."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        os.replace(_save_video(_film(made), made.prepared, Path(folder)), path)
+        args, take = Filmed(), _film(made, best).take
+        with _begin_video(args, take, made.prepared, Path(folder)) as shooting:
+            os.replace(_end_video(args, shooting, {}), path)
 
 
 def folder(mission: str, out: Path | None, force: bool) -> Path:
@@ -185,12 +221,18 @@ def _carry_out(args: Args, made: Run, out: Path) -> Done:
     report = msgspec.structs.replace(_report(made), optimum=best)
     files.write_json(out / "report.json", report)
     files.write_json(out / "timing.json", timing)
-    film = _film(made)
+    film = _film(made, best)
     _save_paths(film, out)
     if interrupted:
         return Done(made, report, timing, out, None, True)
-    video = _save_video(film, made.prepared, out) if args.video else None
-    _save_page(made, film, report, timing, out, video)
+    with contextlib.ExitStack() as stack:
+        shooting = None
+        if args.video:
+            shooting = stack.enter_context(_begin_video(args, film.take, made.prepared, out))
+        plots = _plots(film)  # while the film is being drawn
+        video = _end_video(args, shooting, timing) if shooting is not None else None
+    files.write_json(out / "timing.json", timing)
+    _save_page(made, film, plots, report, timing, out, video)
     return Done(made, report, timing, out, video, False)
 
 
@@ -201,6 +243,7 @@ def _check(args: Args) -> None:
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
     parse(args.decode)
+    _check_film(args)
     if args.mode == "clock" and args.backend == "fused":
         raise InputError("--backend fused", "drives in steps; by the clock mjx or native")
     if args.backend == "fused" and args.viewer:
@@ -223,6 +266,26 @@ def _check(args: Args) -> None:
             raise InputError(f"--{field.name}", "not with --from: the report says it")
 
 
+def _check_film(args: Filmed) -> None:
+    """What can be said of the film's options alone. Raises InputError."""
+    if any(n % 2 or not 160 <= n <= 3840 for n in args.size):
+        raise InputError("--size", f"{args.size[0]} {args.size[1]} is not allowed; both even, "
+                         "from 160 to 3840")
+    for name, value, least, most in (
+            ("--fps", args.fps, 1, 120), ("--seconds", args.seconds, 1, 3600),
+            ("--speed", args.speed, 0.1, 1000)):
+        if value is not None and not least <= value <= most:
+            raise InputError(name, f"{value:g} is not allowed; from {least:g} to {most:g}")
+
+
+def _check_camera(args: Filmed, mission: Mission) -> None:
+    """Raises InputError for a camera that goes along with nobody."""
+    allowed = ["auto", "wide", "chase", *(robot.name for robot in mission.robots)]
+    if args.camera not in allowed:
+        raise InputError("--camera", f"no such camera or robot: {args.camera}; allowed: "
+                         + ", ".join(allowed))
+
+
 def _from_file(args: Args) -> Run:
     """The run of a mission file. Raises InputError for whatever it cannot be."""
     from moonteam.planners import registry
@@ -240,7 +303,7 @@ def _from_file(args: Args) -> Run:
     name = args.planner or "policy"
     planner = registry.make(name, args.planner_options())
     prepared = prepare(mission, args.mission)
-    plan, best = _grid_plan(prepared, planner, args.seed)
+    plan, trace = _grid_plan(prepared, planner, args.seed)
     execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
                           prepared.frame, seed=args.seed, mode=mode)
     if args.backend == "fused":
@@ -250,7 +313,8 @@ def _from_file(args: Args) -> Run:
     who = name if name != "policy" else f"policy {Path(args.policy).stem}"
     return Run(prepared, execution, prepared.scene.qpos0, plan, name,
                None if name == "policy" else args.objective, args.backend or "", args.seed,
-               f"{mission.name}: {who}", command.line("rollout", args), why=why, best=best)
+               f"{mission.name}: {who}", command.line("rollout", args), trace=trace,
+               why=why, best=lambda: _best(prepared, trace))
 
 
 def _with_engine(args: Args) -> tuple[Args, str]:
@@ -302,24 +366,22 @@ def _from_report(args: Args) -> Run:
                staged.width, row.slot, row.report)
 
 
-def _grid_plan(prepared: Prepared, planner: Planner, seed: int
-               ) -> tuple[GridPlan, Callable[[], Optimum | None]]:
-    """The planner on the grid alone, and what the optimum is. Raises InputError if it cannot serve
-    this mission.
-    """
-    from moonteam.planners.base import Snapshot
+def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> tuple[GridPlan, Trace]:
+    """The planner on the grid alone. Raises InputError if it cannot serve this mission."""
     from sim2grid.loop.replan import grid_trace
-    from sim2grid.measure import optimum
     from sim2grid.measure.metrics import GridPlan
 
     trace = grid_trace(prepared.scenario, planner, seed)
+    return GridPlan(trace.complete, trace.makespan, trace.moves), trace
 
-    def best() -> Optimum | None:
-        return None if not trace.complete else optimum.in_steps(
-            Snapshot.start(prepared.scenario), trace.actions, prepared.bodies,
-            prepared.frame.cell_m)
 
-    return GridPlan(trace.complete, trace.makespan, trace.moves), best
+def _best(prepared: Prepared, trace: Trace) -> Optimum | None:
+    """The optimum in steps beside the plan, where there is a plan and that is proved."""
+    from moonteam.planners.base import Snapshot
+    from sim2grid.measure import optimum
+
+    return None if not trace.complete else optimum.in_steps(
+        Snapshot.start(prepared.scenario), trace.actions, prepared.bodies, prepared.frame.cell_m)
 
 
 def _begin_folder(out: Path, args: Args, made: Run) -> None:
@@ -345,7 +407,8 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
     begun = time.perf_counter()
     looks: list[float] = []
     with contextlib.ExitStack() as open_until:
-        update = open_until.enter_context(bar("mission", len(execution.record.targets)))
+        update = open_until.enter_context(bar("mission", len(execution.record.targets),
+                                              plain_s=PLAIN_S))
         show = None
         if args.viewer:
             from sim2grid.show.viewer import LiveView
@@ -395,31 +458,42 @@ def _report(made: Run) -> Report:
         kinds=prepared.kinds, height=ground_height(prepared.site.heights, prepared.site.spacing))
 
 
-def _film(made: Run) -> Film:
+def _film(made: Run, best: Optimum | None) -> Film:
+    """The film as it stands on the record, without 3-D pictures."""
+    from sim2grid.measure import optimum
     from sim2grid.show.film import Film
     from sim2grid.show.picture import Ground
+    from sim2grid.show.take import Take, actors_of, planned_ways
 
-    prepared = made.prepared
-    return Film(prepared.mission, made.execution.record, prepared.frame,
-                Ground(prepared.site.heights, prepared.site.spacing), prepared.bases,
-                made.title, prepared.barred(),
-                glyphs=[robot.kind.glyph for robot in prepared.scene.robots])
+    prepared, site = made.prepared, made.prepared.site
+    ways = () if made.trace is None else planned_ways(made.trace.cells, prepared.frame)
+    return Film(Take(
+        prepared.mission, made.execution.record, prepared.frame,
+        Ground(site.heights, site.spacing), made.title, actors_of(prepared), prepared.barred(),
+        ways, optimum.lines(best), f"{site.name} ground, seed {site.seed}"))
 
 
-def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], out: Path,
-               video: Path | None) -> None:
+def _plots(film: Film) -> list[tuple[str, str]]:
+    from sim2grid.show import plots
+
+    bases = [actor.base for actor in film.take.actors]
+    return [("Who did what when", plots.timeline(film.story)),
+            ("Motion", plots.motion(film.story, bases))]
+
+
+def _save_page(made: Run, film: Film, plots: list[tuple[str, str]], report: Report,
+               timing: dict[str, float], out: Path, video: Path | None) -> None:
     """report.html: everything on one page."""
     import yaml
 
-    from sim2grid.show import page, plots
+    from sim2grid.show import page
     from sim2grid.show.replay import replay
 
     mission = msgspec.to_builtins(made.prepared.written)
     page.write(out / "report.html", page.rollout_page(
         report, command=made.command, made=video, out=out, timing=timing, why=made.why,
         replans=[(round(r.time_s, 1), r.decision, r.words) for r in film.story.replans],
-        plots=[("Who did what when", plots.timeline(film.story)),
-               ("Motion", plots.motion(film.story, film.bases))],
+        plots=plots,
         mission=yaml.safe_dump(mission, sort_keys=False, default_flow_style=None),
         replay=replay(film.story, made.prepared)))
 
@@ -427,35 +501,55 @@ def _save_page(made: Run, film: Film, report: Report, timing: dict[str, float], 
 def _save_paths(film: Film, out: Path) -> None:
     from sim2grid.show import plots
 
-    plots.save_png(plots.paths(film.story, film.ground, film.barred), out / "paths.png")
+    plots.save_png(plots.paths(film.story, film.take.ground, film.take.barred), out / "paths.png")
 
 
-def _save_video(film: Film, prepared: Prepared, out: Path) -> Path:
-    """video.mp4, or map.mp4 where there is nothing to render with, with a word about why."""
+def _style(args: Filmed) -> Style:
+    from sim2grid.show.take import Style
+
+    return Style(args.size, args.fps, args.seconds, args.speed, args.camera, args.shadows,
+                 args.layout)
+
+
+def _begin_video(args: Filmed, take: Take, prepared: Prepared, out: Path) -> Shooting:
+    """Begins video.mp4 in processes of its own; map.mp4 where there is nothing to render with,
+    with a word about why.
+    """
     from moonteam.physics.render import RenderingUnavailable
-    from sim2grid.show.film import write
-    from sim2grid.show.views import SceneViews
+    from sim2grid.show.studio import Shooting
 
-    path, views = out / "video.mp4", None
-    try:
-        views = SceneViews(prepared, film)
-        film = film.with_views(views)
-    except RenderingUnavailable as error:
-        print(f"moonteam: {error}", file=sys.stderr)
-        print("moonteam: no 3-D video; making map.mp4 instead", file=sys.stderr)
-        path = out / "map.mp4"
-    count = 0
-    with bar("video", film.num_frames) as update:
+    name = "map.mp4"
+    if args.layout != "map":
+        from moonteam.physics import stage
 
-        def drawn() -> None:
-            nonlocal count
-            count += 1
-            update(count, path.name)
+        try:
+            stage.check()
+            tops = prepared.site.surface.tops
+            take = replace(take, model=stage.painted(prepared.scene),
+                           tops=take.ground.heights if tops is None else _array(tops))
+            name = "video.mp4"
+        except RenderingUnavailable as error:
+            print(f"moonteam: {error}", file=sys.stderr)
+            print("moonteam: no 3-D video; making map.mp4 instead", file=sys.stderr)
+    return Shooting(take, _style(args), out / name)
 
-        write(film, path, drawn)
-    if views is not None:
-        views.shut()
-    return path
+
+def _array(values: object) -> npt.NDArray:
+    import numpy as np
+
+    return np.asarray(values)
+
+
+def _end_video(args: Filmed, shooting: Shooting, timing: dict[str, float]) -> Path:
+    """Waits for the film; writes it once more as is asked for."""
+    from moonteam.report import video
+
+    with bar("video", shooting.num_frames, plain_s=PLAIN_S) as update:
+        cost = shooting.wait(lambda done: update(done, shooting.path.name))
+    timing |= cost.timing()
+    for kind in args.also:
+        video.for_readme(shooting.path, shooting.path.with_suffix(f".{kind}"))
+    return shooting.path
 
 
 def _difference(before: Report, now: Report) -> str:

@@ -73,6 +73,16 @@ def words(found: Optimum) -> str:
             "steps")
 
 
+def lines(found: Optimum | None) -> tuple[str, ...]:
+    """The same as lines for a picture; one that says so where no optimum is proved."""
+    if found is None:
+        return ("the optimum is not proved",)
+    if found.plan_steps is None or found.optimum_steps is None:
+        return (f"certified optimum: {found.optimum_s:.1f} s", f"plan: {found.plan_s:.1f} s")
+    return (f"certified optimum: {found.optimum_steps} steps, {found.optimum_s:.1f} s at "
+            "travelling speed", f"plan: {found.plan_steps} steps, {found.plan_s:.1f} s")
+
+
 def _seconds(actions: npt.NDArray[np.int32], bodies: Sequence[Body], cell_m: float) -> float:
     """Seconds of joint actions [T, R] at travelling speed."""
     each = cell_m / np.array([body.speed for body in bodies])

@@ -1,27 +1,22 @@
-"""The film of an execution: the scene in 3-D, close views of the robots, the map, the words.
+"""The film of an execution: 3-D pictures with names in them, the map, the words.
 
-Where nothing can be rendered the map alone fills the film. Sizes are pixels and even, as
-h264 wants them.
+Where nothing can be rendered the map alone fills the film. Sizes are pixels; `unit` is what a
+picture 720 pixels high calls one.
 """
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from moonteam.problem.mission import Mission
-from moonteam.report import video
-from moonteam.robots.base import Glyph
-from sim2grid.frame import Frame
-from sim2grid.loop.record import Record
 from sim2grid.measure.story import Replan, Story
+from sim2grid.show.cut import Shot, cut
+from sim2grid.show.hud import Box, Label, Labels, card, chip, plate, put
 from sim2grid.show.picture import (
     GREY,
     INK,
@@ -30,31 +25,23 @@ from sim2grid.show.picture import (
     REPLAN,
     SOLVED,
     STATES,
-    Ground,
     MapPicture,
     RobotMark,
     TargetMark,
     draw_replan,
-    draw_robot,
-    font,
     requirement,
     robot_color,
     skills_of,
 )
+from sim2grid.show.take import Style, Take, ways
 
-WIDTH, HEIGHT = 854, 480
-FPS = 20
-LONGEST_S = 17.0  # of motion; what is longer is shown faster
-SHORTEST_S = 9.0
-HOLD_S = 2.0  # the last moment stands still
-SPEEDS = (0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100)
-MARGIN = 10
-SIDE = 190  # of the map beside 3-D pictures
-CLOSE = (168, 112)  # largest size of a robot's close view
+MARGIN = 14  # units
+SIDE = 236  # of the map beside 3-D pictures, units
+CHIP = (236, 50)  # a robot's plate, units
 AT_REST = 0.12  # m/s
 NEWS_S = 1.6  # film seconds for which the cause of a new plan is told
-FREE = (MARGIN, 9 * MARGIN, WIDTH - SIDE - 3 * MARGIN, HEIGHT - CLOSE[1] - 2 * MARGIN)
-"""Left, top, right, bottom of what no map, list or close view covers."""
+PATH_POINTS = 160  # of a driven path on the map
+DIM: tuple[int, int, int] = (170, 178, 195)
 
 
 @dataclass(frozen=True)
@@ -70,76 +57,52 @@ class Moment:
     goals: tuple[npt.NDArray, ...]  # [2] m, where each robot is bound
     targets: int  # how many are known
     replans: tuple[Replan, ...]  # so far
+    ways: tuple[npt.NDArray, ...]  # [n, 2] m, where each robot means to go, itself first
+
+
+class Seen(NamedTuple):
+    """A 3-D picture [h, w, 3], where names belong in it, and what they should leave free."""
+
+    picture: npt.NDArray[np.uint8]
+    labels: list[Label]
+    covered: list[Box]
 
 
 class Views(Protocol):
     """The 3-D pictures of a moment."""
 
-    def main(self, moment: Moment, qpos: npt.NDArray) -> npt.NDArray[np.uint8]:
-        """[HEIGHT, WIDTH, 3]: the whole scene."""
+    def seen(self, shot: int, share: float, moment: Moment, qpos: npt.NDArray) -> Seen:
+        """What a shot's camera sees, `share` of the shot being over."""
         ...
-
-    def close(self, moment: Moment, qpos: npt.NDArray, robot: int) -> npt.NDArray[np.uint8]:
-        """[CLOSE[1], CLOSE[0], 3]: one robot from near by."""
-        ...
-
-
-def playback(seconds: float) -> float:
-    """How many mission seconds pass in a second of film."""
-    for speed in SPEEDS:
-        if seconds / speed <= LONGEST_S:
-            return speed
-    return math.ceil(seconds / LONGEST_S)
 
 
 class Film:
-    """Cuts a record into frames; without `views` the map fills them."""
+    """Cuts a take into pictures; without `views` the map fills them."""
 
-    def __init__(self, mission: Mission, record: Record, frame: Frame, ground: Ground,
-                 bases: Sequence[int], title: str,
-                 barred: npt.NDArray[np.bool_] | None = None, views: Views | None = None,
-                 glyphs: Sequence[Glyph] = ()):
-        self.mission, self.record, self.title, self.views = mission, record, title, views
-        self.frame, self.ground, self.bases, self.barred = frame, ground, bases, barred
-        # How each robot is marked on the map.
-        self.glyphs: Sequence[Glyph] = glyphs or ("disc",) * len(mission.robots)
-        self.story = Story(mission, record, frame, bases)
+    def __init__(self, take: Take, style: Style | None = None, views: Views | None = None):
+        self.take, self.style, self.views = take, style or Style(), views
+        self.mission, self.record = take.mission, take.record
+        bases = [actor.base for actor in take.actors]
+        self.story = Story(take.mission, take.record, take.frame, bases)
         self.times, self.qpos, self.paths = self.story.times, self.story.qpos, self.story.paths
-        # A robot's close view is drawn afresh now and then, and when a target is solved.
-        self._close: dict[int, tuple[frozenset[int], Image.Image]] = {}
-        self.speed = playback(record.seconds())
-        self.map = MapPicture(frame, ground, SIDE if views else HEIGHT - 2 * MARGIN, barred)
-
-    def with_views(self, views: Views) -> Film:
-        """The same film with 3-D pictures."""
-        return Film(self.mission, self.record, self.frame, self.ground, self.bases, self.title,
-                    self.barred, views, self.glyphs)
-
-    def last_map(self, side: int) -> Image.Image:
-        """The map at the end of the mission with every path, `side` pixels."""
-        moment = self.moment(self.record.seconds())
-        return MapPicture(self.frame, self.ground, side, self.barred).draw(*self._marks(moment))
+        self.width, self.height = self.style.size
+        self.unit = self.height / 720
+        self.shots = cut(self.story, self.style.seconds, self.style.fps,
+                         camera=self.style.camera, speed=self.style.speed)
+        self._first = np.cumsum([0, *(shot.frames for shot in self.shots)])
+        self._map: MapPicture | None = None
+        self._still: tuple[int, Image.Image] | None = None  # behind a card, by its shot
 
     @property
     def num_frames(self) -> int:
-        """Frames, the still ones at the end included."""
-        moving = max(self.record.seconds() / self.speed, 0.0)
-        return math.ceil(moving * FPS) + 1 + self._still
+        """Pictures, those of the cards included."""
+        return int(self._first[-1])
 
-    @property
-    def _still(self) -> int:
-        """Frames for which the last moment is held; a short film is held longer."""
-        return round(max(HOLD_S, SHORTEST_S + HOLD_S - self.record.seconds() / self.speed) * FPS)
-
-    def frames(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """[HEIGHT, WIDTH, 3] pictures, in order."""
-        last = None
-        for k in range(self.num_frames - self._still):
-            last = self.picture(k / FPS * self.speed)
-            yield last
-        for _ in range(self._still):
-            if last is not None:
-                yield last
+    def shot_of(self, number: int) -> tuple[int, float]:
+        """The shot of a picture, and which share of it is over."""
+        index = int(np.searchsorted(self._first, number, side="right")) - 1
+        index = min(index, len(self.shots) - 1)
+        return index, (number - int(self._first[index])) / self.shots[index].frames
 
     def moment(self, time_s: float) -> Moment:
         """What is going on at a mission second."""
@@ -152,156 +115,238 @@ class Film:
         # A robot that has arrived may still be coming to rest.
         status = tuple("moving" if word == "waiting" and speed > AT_REST else word
                        for word, speed in zip(status, speeds, strict=True))
+        index = story.index(time_s)
+        coming = tuple(np.concatenate([self.paths[i][index:index + 1], ways(self.take, i, time_s)])
+                       for i in robots)
         return Moment(
-            time_s, story.index(time_s), decision, frozenset(record.solved_at(time_s)), status,
+            time_s, index, decision, frozenset(record.solved_at(time_s)), status,
             speeds, goals, story.targets_at(decision),
-            tuple(r for r in story.replans if r.time_s <= time_s + 1e-9))
+            tuple(r for r in story.replans if r.time_s <= time_s + 1e-9), coming)
 
-    def picture(self, time_s: float) -> npt.NDArray[np.uint8]:
-        """[HEIGHT, WIDTH, 3]: the film's picture of a mission second."""
+    def pose(self, time_s: float) -> npt.NDArray[np.float64]:
+        """qpos [nq] at a mission second, between the logged ones."""
+        after = self.story.index(time_s)
+        before = max(after - 1, 0)
+        gap = self.times[after] - self.times[before]
+        share = 1.0 if gap <= 0 else float(np.clip((time_s - self.times[before]) / gap, 0.0, 1.0))
+        first, last = (self.qpos[k].astype(float) for k in (before, after))
+        for actor in self.take.actors:
+            turn = slice(actor.base + 3, actor.base + 7)
+            if first[turn] @ last[turn] < 0:
+                last[turn] = -last[turn]
+        return np.nan_to_num((1.0 - share) * first + share * last)
+
+    def picture(self, number: int) -> npt.NDArray[np.uint8]:
+        """[height, width, 3]: the film's picture of that number."""
+        index, share = self.shot_of(number)
+        shot = self.shots[index]
+        time_s = min(shot.time(number - int(self._first[index])), self.record.seconds())
         moment = self.moment(time_s)
-        top = self.map.draw(*self._marks(moment), labels=self.views is None)
-        if self.views is None:
-            image = Image.new("RGB", (WIDTH, HEIGHT), NIGHT)
-            image.paste(top, (MARGIN, MARGIN))
-            side = self.map.size[0] + 3 * MARGIN
-            pen = ImageDraw.Draw(image, "RGBA")
-            self._words(pen, moment, (side, MARGIN))
-            bottom = self._target_list(pen, moment, (side, 125), HEIGHT - 34 * len(self.paths))
-            self._robot_list(pen, moment, (side, bottom + 14))
-            return np.asarray(image)
-        image = Image.fromarray(self.views.main(moment, self.qpos[moment.index]))
-        pen = ImageDraw.Draw(image, "RGBA")
-        left = WIDTH - MARGIN - top.width
-        pen.rectangle([left - 3, MARGIN - 3, left + top.width + 2, MARGIN + top.height + 2],
-                      fill=(*NIGHT, 255))
-        image.paste(top, (left, MARGIN))
-        self._words(pen, moment, (MARGIN, MARGIN - 2))
-        free = self._close_views(image, pen, moment) < left
-        self._target_list(pen, moment, (left, MARGIN + top.height + 8),
-                          HEIGHT - MARGIN if free else FREE[3])
+        if shot.kind in ("title", "end"):
+            if self._still is None or self._still[0] != index:
+                self._still = index, self._drawn(index, 0.5, moment, time_s)
+            image = self._still[1]
+        else:
+            image = self._drawn(index, share, moment, time_s)
+        if shot.kind == "title":
+            image = card(image, self.title_lines(), self.unit, min(1.0, 6.0 * (1.0 - share)))
+        if shot.kind == "end":
+            image = card(image, self.end_lines(), self.unit, min(1.0, 0.2 + 4.0 * share))
         return np.asarray(image)
 
-    def _marks(self, moment: Moment) -> tuple[
+    def _drawn(self, index: int, share: float, moment: Moment, time_s: float) -> Image.Image:
+        """A moment with all that lies over it, but for the cards."""
+        shot = self.shots[index]
+        if self.views is None:
+            return self._map_alone(moment)
+        seen = self.views.seen(index, share, moment, self.pose(time_s))
+        image = Image.fromarray(seen.picture)
+        if shot.kind in ("title", "end"):
+            return image
+        if self.style.layout == "clean":
+            self._labels(seen.covered, []).draw(image, seen.labels)
+        else:
+            self._over(image, shot, moment, seen)
+        return image
+
+    def title_lines(self) -> list[tuple[str, float, tuple[int, int, int]]]:
+        """Text, size and colour of each line of the first card."""
+        mission = self.mission
+        wide, high = (n * mission.map.cell_m for n in mission.map.size)
+        lines = [(self.take.title, 46.0, INK),
+                 (f"{_many(len(mission.robots), 'robot')}, {_many(len(mission.targets), 'target')}"
+                  f", {wide:g} x {high:g} m", 24.0, DIM)]
+        if self.take.about:
+            lines.append((self.take.about, 20.0, DIM))
+        for i, robot in enumerate(mission.robots[:6]):
+            lines.append((f"{robot.name}: {robot.kind}, {skills_of(robot)}", 24.0, robot_color(i)))
+        return lines
+
+    def end_lines(self) -> list[tuple[str, float, tuple[int, int, int]]]:
+        """Text, size and colour of each line of the last card."""
+        record = self.record
+        word, color = ("Mission complete", SOLVED) if record.success else (
+            f"Mission failed: {(record.failure or '').replace('_', ' ')}", OPEN)
+        solved = len(record.solved_at(record.seconds()))
+        lines = [(word, 46.0, color),
+                 (f"{solved} of {_many(len(record.targets), 'target')} in {record.seconds():.1f} s"
+                  f", {_many(len(record.decisions), 'decision')}", 28.0, INK)]
+        lines += [(line, 22.0, DIM) for line in self.take.optimum]
+        return [*lines, (self.take.title, 20.0, DIM)]
+
+    def _over(self, image: Image.Image, shot: Shot, moment: Moment, seen: Seen) -> None:
+        """All that lies over a 3-D picture."""
+        u, margin = self.unit, MARGIN * self.unit
+        top = self._map_picture(round(SIDE * u)).draw(*self._marks(moment, PATH_POINTS),
+                                                      labels=False, wished=moment.ways)
+        left = round(self.width - margin - top.width)
+        plate(image, (left - 4, margin - 4, left + top.width + 3, margin + top.height + 3), 235)
+        image.paste(top, (left, round(margin)))
+        bottom = self._target_list(image, moment, (left, margin + top.height + 10 * u))
+        hidden = [(left - 6.0, 0.0, float(self.width), float(bottom)),
+                  (0.0, 0.0, 360 * u, 118 * u), *self._strip(image, moment)]
+        caption = self._words(image, shot, moment)
+        self._labels(seen.covered, [*hidden, *caption]).draw(image, seen.labels)
+
+    def _labels(self, covered: list[Box], hidden: list[Box]) -> Labels:
+        return Labels((self.width, self.height), [*covered, *hidden], hidden,
+                      round(16 * self.unit))
+
+    def _map_picture(self, side: int) -> MapPicture:
+        if self._map is None:
+            self._map = MapPicture(self.take.frame, self.take.ground, side, self.take.barred)
+        return self._map
+
+    def _map_alone(self, moment: Moment) -> Image.Image:
+        """The map, the words and the lists: where there are no 3-D pictures."""
+        u = self.unit
+        image = Image.new("RGB", (self.width, self.height), NIGHT)
+        top = self._map_picture(round(self.height - 2 * MARGIN * u)).draw(
+            *self._marks(moment, PATH_POINTS), wished=moment.ways)
+        image.paste(top, (round(MARGIN * u), round(MARGIN * u)))
+        left = top.width + 3 * MARGIN * u
+        self._clock(image, moment, (left, 60 * u))
+        put(image, (left, MARGIN * u), self.take.title, round(20 * u))
+        bottom = self._target_list(image, moment, (left, 170 * u))
+        for i in range(len(self.mission.robots)):
+            y = bottom + (20 + 58 * i) * u
+            if y + 50 * u < self.height:
+                right = min(left + 300 * u, self.width - 4)
+                self._chip(image, moment, i, (left, y, right, y + 50 * u))
+        return image
+
+    def _marks(self, moment: Moment, points: int) -> tuple[
             list[RobotMark], list[TargetMark], list[npt.NDArray]]:
         """Robots, targets and the places [2] m of new plans, for the map."""
         lost = {x.robot for x in self.record.losses if x.time_s <= moment.time_s + 1e-9}
-        step = max(1, (moment.index + 1) // 1500)
+        step = max(1, (moment.index + 1) // points)
         robots = []
         for i, spec in enumerate(self.mission.robots):
             path = self.paths[i][:moment.index + 1]
             thinned = np.concatenate([path[::step], path[-1:]])
-            robots.append(RobotMark(spec.name, self.glyphs[i], thinned, i in lost))
+            robots.append(RobotMark(spec.name, self.take.actors[i].glyph, thinned, i in lost))
         targets = [TargetMark(self.record.target_names[j], target, j in moment.solved)
                    for j, target in enumerate(self.record.targets[:moment.targets])]
         return robots, targets, [r.xy for r in moment.replans if r.xy is not None]
 
-    def _words(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int]) -> None:
-        """Title, then time, decision and solved count, then news."""
-        x, y = at
-        _shadowed(pen, (x, y), self.title, 18, INK)
-        done = len(moment.solved)
-        _shadowed(pen, (x, y + 25), f"{moment.time_s:.1f} s  ({self.speed:g}x)   "
-                  f"decision {moment.decision}", 15, INK)
-        _shadowed(pen, (x, y + 46), f"solved {done} of {moment.targets}", 15,
-                  SOLVED if done == moment.targets else INK)
-        if moment.replans:
-            width = pen.textlength(f"solved {done} of {moment.targets}", font(15, True))
-            draw_replan(pen, (x + width + 24, y + 56), 6)
-            _shadowed(pen, (x + width + 34, y + 46), f"{len(moment.replans)}", 15, REPLAN)
-        if moment.time_s >= self.record.seconds() - 1e-9:
-            word, color = ("mission complete", SOLVED) if self.record.success else (
-                f"mission failed: {(self.record.failure or '').replace('_', ' ')}", OPEN)
-            _shadowed(pen, (x, y + 67), word, 17, color)
-        elif news := [r.words for r in moment.replans
-                      if r.time_s > moment.time_s - NEWS_S * self.speed]:
-            _shadowed(pen, (x, y + 67), f"replan: {', '.join(news[-2:])}", 15, REPLAN)
+    def _words(self, image: Image.Image, shot: Shot, moment: Moment) -> list[Box]:
+        """Title, clock and speed at the top, what a picture is about above the strip.
 
-    def _target_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int],
-                     bottom: int) -> int:
+        Returns the box of the latter, if there is any.
+        """
+        u = self.unit
+        plate(image, (4 * u, 4 * u, 352 * u, 112 * u), 110)
+        put(image, (MARGIN * u, 10 * u), self.take.title, round(18 * u))
+        y = self._clock(image, moment, (MARGIN * u, 36 * u), shot.speed(self.style.fps))
+        news = [r.words for r in moment.replans
+                if r.time_s > moment.time_s - NEWS_S * max(shot.speed(self.style.fps), 1.0)]
+        if news and shot.kind != "end":
+            put(image, (MARGIN * u, y), f"new plan: {', '.join(news[-2:])}", round(16 * u), REPLAN)
+        caption, color = shot.words, INK
+        if shot.words == "introduction" and shot.robot is not None:
+            robot = self.mission.robots[shot.robot]
+            caption = f"{robot.name}: {robot.kind}, {skills_of(robot)}"
+            color = robot_color(shot.robot)
+        elif shot.target is not None and shot.words.endswith("solved"):
+            done = shot.target in moment.solved
+            name = self.record.target_names[shot.target]
+            caption = shot.words if done else (
+                f"{name} needs {requirement(self.record.targets[shot.target])}")
+            color = SOLVED if done else OPEN
+        if not caption:
+            return []
+        top = self.height - (CHIP[1] + MARGIN + 52) * u
+        wide = put(image, (MARGIN * u, top), caption, round(30 * u), color)
+        return [(0.0, top, MARGIN * u + wide, top + 40 * u)]
+
+    def _clock(self, image: Image.Image, moment: Moment, at: tuple[float, float],
+               speed: float | None = None) -> float:
+        """Time, speed, decision, how many targets are solved; returns where it ends."""
+        u, (x, y) = self.unit, at
+        minutes, seconds = divmod(moment.time_s, 60.0)
+        wide = put(image, (x, y), f"{int(minutes)}:{seconds:04.1f}", round(30 * u))
+        if speed is not None and speed > 0:
+            words = "true speed" if abs(speed - 1.0) < 0.05 else f"{speed:.2g} times true speed"
+            put(image, (x + wide + 14 * u, y + 10 * u), words, round(17 * u), DIM)
+        done = len(moment.solved)
+        wide = put(image, (x, y + 44 * u), f"{done} of {_many(moment.targets, 'target')} solved",
+                   round(17 * u), SOLVED if done == moment.targets else INK)
+        if moment.replans:
+            pen = ImageDraw.Draw(image, "RGBA")
+            draw_replan(pen, (x + wide + 20 * u, y + 56 * u), 8 * u)
+            put(image, (x + wide + 32 * u, y + 44 * u), f"{len(moment.replans)}", round(17 * u),
+                REPLAN)
+        return y + 70 * u
+
+    def _target_list(self, image: Image.Image, moment: Moment, at: tuple[float, float]) -> float:
         """The targets, closer together and in two columns where they are many; returns where
         the list ends.
         """
-        x, y = at
-        columns = 1 if (bottom - y) / max(moment.targets, 1) >= 13 else 2
+        u, (x, y) = self.unit, at
+        bottom = self.height - (CHIP[1] + 2 * MARGIN) * u
+        columns = 1 if (bottom - y) / max(moment.targets, 1) >= 15 * u else 2
         lines = max(1, math.ceil(moment.targets / columns))
-        row = min(20.0, (bottom - y) / lines)
+        row = min(23.0 * u, (bottom - y) / lines)
+        end = y + lines * row
+        plate(image, (x - 4, y - 3, x + SIDE * u + 3, end + 3), 120)
+        pen = ImageDraw.Draw(image, "RGBA")
         for j, target in enumerate(self.record.targets[:moment.targets]):
             color = SOLVED if j in moment.solved else OPEN
-            left, top = x + j // lines * SIDE // 2, round(y + j % lines * row)
-            box = round(0.55 * row)
-            pen.rectangle([left, top + 3, left + box, top + 3 + box], fill=(*NIGHT, 160),
-                          outline=color, width=3 if row > 15 else 2)
-            text = f"{self.record.target_names[j]}  {requirement(target)}"
-            _shadowed(pen, (left + 18, top), text, max(8, round(0.66 * row)), color)
-        return round(y + lines * row)
+            left, top = x + j // lines * SIDE * u / 2 + 4, y + j % lines * row
+            box = 0.5 * row
+            pen.rectangle([left, top + 0.25 * row, left + box, top + 0.25 * row + box],
+                          fill=(*color, 255) if j in moment.solved else None,
+                          outline=color, width=2)
+            size = max(8, round(0.66 * row))
+            wide = put(image, (left + 0.5 * row + 8 * u, top + 0.04 * row),
+                       self.record.target_names[j], size, color)
+            if columns == 1:
+                put(image, (left + 0.5 * row + 16 * u + wide, top + 0.08 * row),
+                    requirement(target), round(0.9 * size), DIM)
+        return end
 
-    def _robot_list(self, pen: ImageDraw.ImageDraw, moment: Moment, at: tuple[int, int]) -> None:
-        x, y = at
-        for i, spec in enumerate(self.mission.robots):
-            draw_robot(pen, self.glyphs[i], (x + 7, y + 9), 7, robot_color(i))
-            _shadowed(pen, (x + 20, y), f"{spec.name}  {spec.kind} {skills_of(spec)}", 13,
-                      robot_color(i))
-            _shadowed(pen, (x + 20, y + 16), _doing(moment, i), 12,
-                      STATES.get(moment.status[i].split(":")[0], INK))
-            y += 34
+    def _strip(self, image: Image.Image, moment: Moment) -> list[Box]:
+        """The robots' plates along the bottom; returns their boxes."""
+        u, count = self.unit, len(self.mission.robots)
+        gap = MARGIN * u
+        wide = min(CHIP[0] * u, (self.width - gap) / count - gap)
+        boxes = []
+        for i in range(count):
+            x = gap + i * (wide + gap)
+            box = (x, self.height - gap - CHIP[1] * u, x + wide, self.height - gap)
+            self._chip(image, moment, i, box)
+            boxes.append(box)
+        return boxes
 
-    def _close_views(self, image: Image.Image, pen: ImageDraw.ImageDraw, moment: Moment) -> int:
-        """The strip along the bottom: each robot from near by, its name, kind and skills, what
-        it does and how fast. Returns where the strip ends.
-        """
-        count = len(self.mission.robots)
-        width = min(CLOSE[0], (WIDTH - (count + 1) * MARGIN) // count)
-        y, x = HEIGHT - MARGIN - CLOSE[1], MARGIN
-        number = round(moment.time_s / self.speed * FPS)
-        for i, spec in enumerate(self.mission.robots):
-            lost = moment.status[i].startswith("lost")
-            color = GREY if lost else robot_color(i)
-            pen.rectangle([x - 2, y - 2, x + width + 1, y + CLOSE[1] + 1], fill=(*color, 255))
-            cut = (CLOSE[0] - width) // 2
-            image.paste(self._close_view(moment, i, number).crop(
-                (cut, 0, cut + width, CLOSE[1])), (x, y))
-            draw_robot(pen, self.glyphs[i], (x + 12, y + 12), 6, color)
-            _shadowed(pen, (x + 23, y + 3), spec.name, 12, color)
-            _shadowed(pen, (x + 23, y + 18), f"{spec.kind} {skills_of(spec)}", 10, INK)
-            word = moment.status[i]
-            state = STATES.get(word.split(":")[0], INK)
-            _shadowed(pen, (x + 6, y + CLOSE[1] - 18), word, 12, state)
-            if not lost:
-                speed = f"{moment.speeds[i]:.2f} m/s"
-                wide = pen.textlength(speed, font(12, True))
-                high = 18 if width > 140 else 34
-                right = x + width - 6 - wide if width > 140 else x + 6
-                _shadowed(pen, (right, y + CLOSE[1] - high), speed, 12, INK)
-            x += width + MARGIN
-        return x - MARGIN
-
-    def _close_view(self, moment: Moment, robot: int, number: int) -> Image.Image:
-        """[CLOSE]: drawn afresh in every second frame, in turn where robots are many."""
-        held = self._close.get(robot)
-        turns = max(2, len(self.mission.robots) // 2)
-        if held is None or held[0] != moment.solved or (number + robot) % turns == 0:
-            assert self.views is not None
-            drawn = self.views.close(moment, self.qpos[moment.index], robot)
-            held = self._close[robot] = moment.solved, Image.fromarray(drawn)
-        return held[1]
+    def _chip(self, image: Image.Image, moment: Moment, robot: int, box: Box) -> None:
+        spec, word = self.mission.robots[robot], moment.status[robot]
+        lost = word.startswith("lost")
+        color = GREY if lost else robot_color(robot)
+        state = word if lost else f"{word}  {moment.speeds[robot]:.2f} m/s"
+        chip(image, box, self.take.actors[robot].glyph, color,
+             [(f"{spec.name}  {skills_of(spec)}", color),
+              (state, STATES.get(word.split(":")[0], INK))], self.unit)
 
 
-def write(film: Film, path: str | os.PathLike[str],
-          progress: Callable[[], None] = lambda: None) -> None:
-    """Writes the film as h264, whole or not at all; `progress` is called after each frame."""
-    with video.writing(path, (HEIGHT, WIDTH), FPS, crf=23) as add:
-        for picture in film.frames():
-            add(picture)
-            progress()
-
-
-def _doing(moment: Moment, robot: int) -> str:
-    """As in: moving 0.42 m/s."""
-    word = moment.status[robot]
-    return word if word.startswith("lost") else f"{word}  {moment.speeds[robot]:.2f} m/s"
-
-
-def _shadowed(pen: ImageDraw.ImageDraw, at: tuple[float, float], text: str, size: int,
-              color: tuple[int, int, int]) -> None:
-    pen.text(at, text, color, font(size, True), stroke_width=2, stroke_fill=NIGHT)
+def _many(count: int, word: str) -> str:
+    return f"{count} {word}" + ("" if count == 1 else "s")

@@ -174,8 +174,7 @@ def requirement(skills: Sequence[str], kind: str) -> str:
 def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
                  replans: Sequence[tuple[float, int, str]] = (),
                  plots: Sequence[tuple[str, str]] = (), timing: dict[str, float] | None = None,
-                 mission: str = "", why: str = "", replay: str = "",
-                 optimum: Sequence[str] = ()) -> str:
+                 mission: str = "", why: str = "", replay: str = "") -> str:
     """A rollout's page.
 
     Args:
@@ -189,7 +188,6 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
       mission: the mission file's text.
       why: the engine is this one.
       replay: in 3-D, as `replay.replay` makes it.
-      optimum: lines on what the best plan would have taken.
     """
     verdict = '<span class="good">success</span>' if report.success else (
         f'<span class="bad">failed: {html.escape((report.cause or "").replace("_", " "))}</span>')
@@ -211,7 +209,6 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
             ("causes of new plans", len(replans)),
             *([("times real time", timing["real_time_factor"])]
               if timing and "real_time_factor" in timing else [])]),
-        *[f'<p class="dim">{html.escape(line)}</p>' for line in optimum],
         *(["<h2>Replay in 3-D</h2>", replay] if replay else []),
         "<h2>Video</h2>", video(made, out),
         "<h2>Targets</h2>", _targets(report), "<h2>Robots</h2>", _robots(report),

@@ -7,9 +7,11 @@ the map's north is up.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -17,8 +19,10 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from moonteam.problem.mission import Robot, Target
-from moonteam.robots.base import Glyph
 from sim2grid.frame import Frame
+
+if TYPE_CHECKING:
+    from moonteam.robots.base import Glyph
 
 Color = tuple[int, int, int]
 
@@ -53,12 +57,14 @@ def robot_color(index: int) -> Color:
 
 def skills_of(robot: Robot) -> str:
     """Its skills: letters side by side, names apart."""
-    return ("" if all(len(skill) == 1 for skill in robot.skills) else " ").join(robot.skills)
+    return ("" if all(len(skill) == 1 for skill in robot.skills) else ", ").join(robot.skills)
 
 
 def requirement(target: Target) -> str:
-    """A+B for AND, A/B for OR."""
-    return ("/" if target.either else "+").join(target.words())
+    """A+B for AND, A/B for OR; names apart."""
+    words = target.words()
+    sign = "/" if target.either else "+"
+    return (sign if all(len(word) == 1 for word in words) else f" {sign} ").join(words)
 
 
 def hillshade(heights: npt.NDArray, spacing: float) -> npt.NDArray[np.uint8]:
@@ -116,9 +122,11 @@ class MapPicture:
         return self.width // SMOOTH, self.height // SMOOTH
 
     def draw(self, robots: Sequence[RobotMark], targets: Sequence[TargetMark],
-             replans: Sequence[npt.NDArray] = (), labels: bool = True) -> Image.Image:
+             replans: Sequence[npt.NDArray] = (), labels: bool = True,
+             wished: Sequence[npt.NDArray] = ()) -> Image.Image:
         """The map with targets, paths, robots, and a mark at each place [2] m that brought a
-        new plan; `labels` writes names beside them.
+        new plan; `labels` writes names beside them. `wished`: where each robot means to go,
+        [n, 2] m, dashed.
         """
         image = self._base.copy()
         pen = ImageDraw.Draw(image)
@@ -129,6 +137,9 @@ class MapPicture:
                 points = [tuple(p) for p in self._pixels(robot.path)]
                 pen.line(points, fill=robot_color(i), width=max(2, round(self.pixel * 0.07)),
                          joint="curve")
+        for i, way in enumerate(wished):
+            if len(way) > 1 and not robots[i].lost:
+                self._wish(pen, self._pixels(way), robot_color(i))
         for place in replans:
             x, y = self._pixels(place)
             draw_replan(pen, (float(x), float(y)), max(self.pixel * 0.2, 4.5 * SMOOTH))
@@ -181,6 +192,18 @@ class MapPicture:
             _text(pen, (self._fit(pen, x, text, size),
                         y + reach + 2 if below else y - reach - 2),
                   text, color, size, "ma" if below else "md")
+
+    def _wish(self, pen: ImageDraw.ImageDraw, way: npt.NDArray, color: Color) -> None:
+        """A dashed way [n, 2] px, a ring at its end."""
+        dash, line = 4.0 * SMOOTH, max(2, round(1.2 * SMOOTH))
+        for start, end in itertools.pairwise(way):
+            count = max(1, round(float(np.hypot(*(end - start))) / (2 * dash)))
+            for k in range(count):
+                piece = [tuple(start + (end - start) * (k + part) / count) for part in (0.0, 0.5)]
+                pen.line(piece, fill=color, width=line)
+        reach = 4.0 * SMOOTH
+        x, y = way[-1]
+        pen.ellipse([x - reach, y - reach, x + reach, y + reach], outline=color, width=line)
 
     def _fit(self, pen: ImageDraw.ImageDraw, x: float, text: str, size: int) -> float:
         """The middle of a text near x that stays inside the picture."""

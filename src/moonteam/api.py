@@ -111,7 +111,7 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
     if done.interrupted:
         raise KeyboardInterrupt
     return Rollout(done.report, done.made.execution.record, done.out,
-                   partial(command.film, done.made), done.video)
+                   partial(command.film, done.made, done.report.optimum), done.video)
 
 
 def _write(folder: Path, mission: Mission) -> Path:

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from moonteam.cli import main
-from moonteam.physics import backends, render
+from moonteam.physics import backends, stage
 from moonteam.physics.backends import NativeBackend
 from moonteam.physics.render import RenderingUnavailable
 from sim2grid.loop import prepare
-from sim2grid.show import film
 
 GOOD = """
 map: {size: [3, 3], cell_m: 1.0}
@@ -62,6 +61,10 @@ def test_bad_missions_one_line_code_two_nothing_written(tmp_path, capsys, old, n
     (["--planner", "policy", "--policy", "small"], "made for 3 robots"),
     (["--mission", "3"], "give --from REPORT too"),
     (["--contender", "x"], "give --from REPORT too"),
+    (["--size", "641", "360"], "both even"),
+    (["--fps", "0"], "--fps"),
+    (["--speed", "-2"], "--speed"),
+    (["--camera", "nobody"], "auto, wide, chase, hop, roll"),
     (["--from", "report.json"], "not both"),
 ])
 def test_bad_options_one_line_code_two_nothing_written(tmp_path, capsys, options, named):
@@ -146,19 +149,19 @@ def test_a_failed_mission_exits_with_one_and_without_opengl_shows_the_map(
     def nothing(width, height):
         raise RenderingUnavailable("no display")
 
-    monkeypatch.setattr(render, "_open_window", nothing)
-    monkeypatch.setattr(film, "playback", lambda seconds: 10.0)
-    monkeypatch.setattr(film, "SHORTEST_S", 0.0)
-    monkeypatch.setattr(film, "HOLD_S", 0.2)
+    monkeypatch.setattr(stage, "open_window", nothing)
     file, out = tmp_path / "hasty.yaml", tmp_path / "out"
     file.write_text("max_steps: 1\n" + GOOD.replace("start: [1, 0]", "start: [2, 2]"))
-    assert rollout(file, out, "--seed", "0") == 1
+    assert rollout(file, out, "--size", "320", "180", "--fps", "5", "--seconds", "2") == 1
     report = json.loads((out / "report.json").read_text())
     assert (report["success"], report["cause"], report["decisions"]) == (False, "max_steps", 1)
     captured = capsys.readouterr()
     assert "FAILED" in captured.out
     assert "install" in captured.err
     assert (out / "map.mp4").stat().st_size > 1000
+    timing = json.loads((out / "timing.json").read_text())
+    assert timing["film_frames"] == pytest.approx(5 * timing["film_seconds"])
+    assert timing["film_cpu_s"] > 0
     assert not (out / "video.mp4").exists()
 
 

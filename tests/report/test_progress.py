@@ -86,3 +86,17 @@ def test_the_first_time_left_leaves_compiling_out(monkeypatch):
     pace = progress.Pace(3, 0, compilation.working_time)
     spent += 60.0
     assert pace.left(1) == pytest.approx(2.0)
+
+
+def test_elsewhere_plain_lines_say_how_far_and_how_long_where_they_are_asked_for(
+        capsys, monkeypatch):
+    now = iter([0.0, 4.0, 12.0, 13.0, 24.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    with progress.bar("video", 40, plain_s=10.0) as update:
+        for done in (5, 10, 11, 20):
+            update(done, "video.mp4")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.splitlines() == [
+        "moonteam: video 10 of 40, about 0:36 left (video.mp4)",
+        "moonteam: video 20 of 40, about 0:24 left (video.mp4)"]

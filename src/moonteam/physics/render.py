@@ -78,7 +78,7 @@ class Renderer:
         self._follow_shadow = shadow_reach > 0.0
         if self._follow_shadow:
             self._model.vis.map.shadowclip = shadow_reach / self._model.stat.extent
-        self._window = _open_window(width, height)
+        self._window = open_window(width, height)
         atexit.register(self.close)
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -255,7 +255,7 @@ def turn_z_to(axis: Points) -> Points:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
-def _open_window(width: int, height: int) -> Any:
+def open_window(width: int, height: int) -> Any:
     """An off-screen OpenGL context, made current. EGL is asked for directly, so importing
     mujoco never fails where it is missing; MUJOCO_GL=osmesa or glfw is heeded.
     """

@@ -222,7 +222,8 @@ def set_heights(model: mujoco.MjModel, heights: np.ndarray) -> None:
     The compiler itself would stretch them to the full scale.
     """
     scaled = (heights.astype(np.float64) - float(heights.min())) / vertical_range(heights)
-    model.hfield_data[:] = scaled.astype(np.float32).ravel()
+    first = int(model.hfield_adr[model.hfield("ground").id])
+    model.hfield_data[first:first + scaled.size] = scaled.astype(np.float32).ravel()
 
 
 def _add_boulder(spec: mujoco.MjSpec, index: int, boulder: Boulder, friction: float) -> None:

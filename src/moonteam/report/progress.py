@@ -6,6 +6,7 @@ Time left is by what was done since the bar began, compiling left out.
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
@@ -58,13 +59,15 @@ def hours(seconds: float | None) -> str:
 
 
 @contextmanager
-def bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int, str], None]]:
+def bar(title: str, total: int, done: int = 0, *, plain_s: float = 0.0
+        ) -> Iterator[Callable[[int, str], None]]:
     """A bar on standard error if that is a terminal, with the time left: `update(done, words)`.
 
     `done` is what lies behind already, where something is resumed; words may have two lines.
+    `plain_s`: elsewhere a plain line each so many seconds; 0: nothing.
     """
     if not sys.stderr.isatty():
-        yield lambda done, words: None
+        yield _plain(title, total, done, plain_s) if plain_s else lambda done, words: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
@@ -77,6 +80,27 @@ def bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int, str], 
         task = progress.add_task(title, total=total, completed=done, words="", left=hours(None))
         yield lambda done, words: progress.update(task, completed=done, words=words,
                                                   left=hours(pace.left(done)))
+
+
+def _plain(title: str, total: int, behind: int, every_s: float) -> Callable[[int, str], None]:
+    """Lines such as "moonteam: video 210 of 720, about 0:31 left"."""
+    begun = said = time.monotonic()
+
+    def update(done: int, words: str) -> None:
+        nonlocal said
+        now = time.monotonic()
+        if now - said < every_s:
+            return
+        said = now
+        left = ""
+        if behind < done < total:
+            seconds = round((total - done) * (now - begun) / (done - behind))
+            left = f", about {seconds // 60}:{seconds % 60:02d} left"
+        more = " ".join(words.split())
+        print(f"moonteam: {title} {done} of {total}{left}" + (f" ({more})" if more else ""),
+              file=sys.stderr, flush=True)
+
+    return update
 
 
 @contextmanager

@@ -21,8 +21,8 @@ Picture = npt.NDArray[np.uint8]  # [height, width, 3]
 
 
 @contextmanager
-def writing(path: str | os.PathLike[str], size: tuple[int, int], fps: float, crf: int
-            ) -> Iterator[Callable[[Picture], None]]:
+def writing(path: str | os.PathLike[str], size: tuple[int, int], fps: float, crf: int,
+            preset: str = "medium") -> Iterator[Callable[[Picture], None]]:
     """Writes a film as h264, whole or not at all; yields what takes the next picture.
 
     Args:
@@ -30,6 +30,7 @@ def writing(path: str | os.PathLike[str], size: tuple[int, int], fps: float, crf
       size: (height, width) px, both even.
       fps: pictures a second.
       crf: ffmpeg's constant rate factor; less is finer.
+      preset: of x264; a faster one takes less time and makes a larger file.
 
     Raises InputError saying why it cannot be written.
     """
@@ -38,7 +39,8 @@ def writing(path: str | os.PathLike[str], size: tuple[int, int], fps: float, crf
     height, width = size
     words = ["-v", "error", "-f", "rawvideo", "-vcodec", "rawvideo", "-pix_fmt", "rgb24",
              "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-", "-an", "-vcodec", "h264",
-             "-pix_fmt", "yuv420p", "-vb", "0", "-crf", f"{crf}", "-y"]
+             "-pix_fmt", "yuv420p", "-vb", "0", "-crf", f"{crf}", "-preset", preset,
+             "-movflags", "+faststart", "-y"]
     with files.replacing(path) as temporary, tempfile.TemporaryFile() as said:
         process = subprocess.Popen([imageio_ffmpeg.get_ffmpeg_exe(), *words, temporary],
                                    stdin=subprocess.PIPE, stderr=said)
@@ -68,6 +70,28 @@ def writing(path: str | os.PathLike[str], size: tuple[int, int], fps: float, crf
                 process.wait()
             with suppress(BrokenPipeError):
                 stdin.close()
+
+
+def for_readme(film: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Writes a film again as a moving picture that pages show: by the ending, .webp or .gif.
+
+    Smaller and with fewer pictures a second. Raises InputError saying why it cannot be written.
+    """
+    import imageio_ffmpeg
+
+    small = "fps={},scale={}:-2:flags=lanczos"
+    if Path(path).suffix == ".gif":
+        words = ["-vf", small.format(10, 480) + ",split[a][b];[a]palettegen=max_colors=96[p];"
+                 "[b][p]paletteuse=dither=bayer:bayer_scale=4", "-f", "gif"]
+    else:
+        words = ["-vf", small.format(12, 720), "-c:v", "libwebp", "-quality", "50",
+                 "-compression_level", "4", "-f", "webp"]
+    with files.replacing(path) as temporary, tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", film, *words, "-loop", "0", "-y",
+             temporary], stdin=subprocess.DEVNULL, stderr=said)
+        if process.wait():
+            raise _unwritten(path, process, said)
 
 
 def _unwritten(path: str | os.PathLike[str], process: subprocess.Popen[bytes], said: IO[bytes]

@@ -1,62 +1,120 @@
-"""The film: its length, its words, and that it can be read back; nothing is rendered."""
+"""The film: its pictures, its words, and that it can be read back; nothing is rendered."""
 
 import subprocess
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
+from PIL import Image
 
+from moonteam.errors import InputError
+from moonteam.report import video
 from sim2grid.frame import Frame
-from sim2grid.show import film as films
-from sim2grid.show.film import FPS, HEIGHT, WIDTH, Film, playback, write
-from sim2grid.show.picture import Ground, MapPicture, RobotMark, TargetMark, hillshade
+from sim2grid.show.film import Film, Seen
+from sim2grid.show.hud import Label, Labels
+from sim2grid.show.picture import (
+    Ground,
+    MapPicture,
+    RobotMark,
+    TargetMark,
+    hillshade,
+    requirement,
+    skills_of,
+)
+from sim2grid.show.studio import Shooting
+from sim2grid.show.take import Actor, Style, Take, planned_ways
+
+SMALL = Style(size=(320, 180), fps=10, seconds=2.0)
+
+
+def take_of(spec, record, bases, side=4):
+    ground = Ground(np.add.outer(np.arange(33.0), np.zeros(33)) * 0.01, side / 16)
+    return Take(spec, record, Frame((side, side), 1.0), ground, "test",
+                tuple(Actor(base, "disc") for base in bases))
 
 
 @pytest.fixture
-def short_film(mission, execute, script):
+def short_take(mission, execute, script):
     spec = mission(["a drone A 0 0", "b wheeled B 3 3"], ["A OR 1 0", "B OR 3 2"])
-    done = execute(spec, script("right stay", "stay down"))
-    ground = Ground(np.add.outer(np.arange(33.0), np.zeros(33)) * 0.01, 0.25)
-    return Film(spec, done.record, Frame((4, 4), 1.0), ground, [0, 7], "test")
+    return take_of(spec, execute(spec, script("right stay", "stay down")).record, [0, 7])
 
 
-@pytest.mark.parametrize(("seconds", "speed"), [(3.0, 0.25), (16.0, 1), (30.0, 2), (170.0, 10),
-                                                 (1e4, 589)])
-def test_playback_keeps_films_short(seconds, speed):
-    assert playback(seconds) == speed
-    assert seconds / playback(seconds) <= films.LONGEST_S
-
-
-def test_a_film_lasts_ten_seconds_at_least_and_twenty_at_most(short_film):
-    assert 10 <= short_film.num_frames / FPS <= 21
-
-
-def test_moments_tell_what_was_going_on(short_film):
-    start = short_film.moment(0.0)
+def test_moments_tell_what_was_going_on(short_take):
+    film = Film(short_take)
+    start = film.moment(0.0)
     assert start.status == ("moving", "waiting")
     assert start.decision == 1
     assert not start.solved
-    end = short_film.moment(1e9)
+    np.testing.assert_allclose(start.ways[0], [[-1.5, -1.5], [-0.5, -1.5]], atol=0.05)
+    assert len(start.ways[1]) == 1, "b means to stay"
+    end = film.moment(1e9)
     assert end.solved == {0, 1}
-    assert end.time_s == short_film.record.seconds()
+    assert end.time_s == short_take.record.seconds()
     np.testing.assert_allclose(end.goals[1], [1.5, 0.5])
 
 
-def test_the_film_is_written_and_has_its_frames(short_film, tmp_path, monkeypatch):
-    monkeypatch.setattr(films, "SHORTEST_S", 0.0)
-    monkeypatch.setattr(films, "HOLD_S", 0.2)
-    short_film.speed = 8.0
-    write(short_film, tmp_path / "map.mp4")
+def test_poses_between_the_logged_ones_lie_between_them(short_take):
+    film = Film(short_take)
+    before, after = film.times[10], film.times[11]
+    pose = film.pose((before + after) / 2)
+    np.testing.assert_allclose(pose, (film.qpos[10] + film.qpos[11]) / 2, atol=1e-6)
+    np.testing.assert_allclose(film.pose(1e9), film.qpos[-1], atol=1e-6)
+
+
+def test_the_film_is_drawn_by_other_processes_and_has_its_pictures(short_take, tmp_path):
+    shooting = Shooting(short_take, SMALL, tmp_path / "map.mp4", processes=2)
+    seen = []
+    cost = shooting.wait(seen.append)
+    assert cost.frames == shooting.num_frames == Film(short_take, SMALL).num_frames
+    assert cost.cpu_s > 0
+    assert seen[-1] == cost.frames
+    assert set(cost.timing()) == {"film_frames", "film_seconds", "film_cpu_s", "film_wall_s"}
     read = subprocess.run(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "map.mp4", "-f", "rawvideo",
          "-pix_fmt", "rgb24", "-"], capture_output=True, check=True)
     assert b"h264" in read.stderr
-    assert f"{FPS} fps".encode() in read.stderr
-    video = np.frombuffer(read.stdout, np.uint8).reshape(-1, HEIGHT, WIDTH, 3)
-    assert video.shape == (short_film.num_frames, HEIGHT, WIDTH, 3)
-    assert video[0].std() > 10, "not an empty picture"
-    assert np.abs(video[0].astype(int) - video[-1]).max() > 60, "something changed"
+    assert b"10 fps" in read.stderr
+    pictures = np.frombuffer(read.stdout, np.uint8).reshape(-1, 180, 320, 3)
+    assert len(pictures) == cost.frames
+    own = Film(short_take, SMALL).picture(9)
+    assert np.abs(pictures[9].astype(int) - own).mean() < 6, "in order"
+    for kind, magic in (("webp", b"WEBP"), ("gif", b"GIF8")):
+        video.for_readme(tmp_path / "map.mp4", tmp_path / f"map.{kind}")
+        assert magic in (tmp_path / f"map.{kind}").read_bytes()[:16]
+    with pytest.raises(InputError, match="cannot be written"):
+        video.for_readme(tmp_path / "none.mp4", tmp_path / "none.webp")
+    assert not list(tmp_path.glob("none*"))
+
+
+def test_a_film_that_is_stopped_leaves_nothing(short_take, tmp_path):
+    shooting = Shooting(short_take, SMALL, tmp_path / "map.mp4", processes=1)
+
+    def interrupt(done):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        shooting.wait(interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_cards_say_the_planner_and_the_optimum(short_take):
+    from dataclasses import replace
+
+    film = Film(replace(short_take, title="two: exact", optimum=("proved optimum: 2 decisions",)))
+    title = [line for line, _, _ in film.title_lines()]
+    assert title[0] == "two: exact"
+    assert "2 robots, 2 targets, 4 x 4 m" in title
+    end = [line for line, _, _ in film.end_lines()]
+    assert end[0] == "Mission complete"
+    assert end[1].startswith("2 of 2 targets in ")
+    assert "proved optimum: 2 decisions" in end
+
+
+def test_planned_ways_leave_out_who_stays():
+    cells = np.array([[[0, 0], [3, 3]], [[1, 0], [3, 3]], [[1, 0], [3, 2]]])
+    first, second = planned_ways(cells, Frame((4, 4), 1.0))
+    np.testing.assert_allclose(first, [[-1.5, -1.5], [-0.5, -1.5]])
+    np.testing.assert_allclose(second, [[1.5, 1.5], [1.5, 0.5]])
 
 
 def test_the_map_puts_north_up_and_colours_targets_by_state(mission):
@@ -64,12 +122,28 @@ def test_the_map_puts_north_up_and_colours_targets_by_state(mission):
     picture = MapPicture(Frame((4, 4), 1.0), Ground(np.zeros((17, 17)), 0.25), 400)
     marks = [TargetMark("far", spec.targets[0], True), TargetMark("near", spec.targets[1], False)]
     robots = [RobotMark("a", "triangle", np.array([[-1.5, -1.5]]))]
-    image = np.asarray(picture.draw(robots, marks, labels=False)).astype(int)
+    wished = [np.array([[-1.5, -1.5], [1.5, -1.5]])]
+    image = np.asarray(picture.draw(robots, marks, labels=False, wished=wished)).astype(int)
     top_right, top_left = image[:100, 300:], image[:100, :100]
     assert (top_right[..., 1] - top_right[..., 0]).max() > 100, "green: solved"
     assert (top_left[..., 0] - top_left[..., 1]).max() > 100, "red: open"
     lower_left = image[300:, :100]
     assert (lower_left[..., 2] - lower_left[..., 0]).max() > 100, "the robot's blue"
+    between = image[345:355, 120:300]
+    blue = (between[..., 2] - between[..., 0] > 60).any(axis=0)
+    assert 0.3 < blue.mean() < 0.8, "where it means to go is dashed"
+
+
+def test_skills_with_names_stand_apart(mission):
+    import msgspec
+
+    spec = mission(["a drone A 0 0", "b legged AB 1 1"], ["AB AND 1 0", "AB OR 2 2"])
+    target, robot = spec.targets[0], spec.robots[1]
+    assert (requirement(target), requirement(spec.targets[1])) == ("A+B", "A/B")
+    assert skills_of(robot) == "AB"
+    named = msgspec.structs.replace(target, skills=("camera", "radio"))
+    assert requirement(named) == "camera + radio"
+    assert skills_of(msgspec.structs.replace(robot, skills=("camera", "radio"))) == "camera, radio"
 
 
 def test_hillshade_lights_slopes_that_face_north_west():
@@ -79,14 +153,25 @@ def test_hillshade_lights_slopes_that_face_north_west():
     assert facing > averted + 50
 
 
+def test_labels_lie_over_nothing():
+    image = Image.new("RGB", (640, 360), (60, 60, 60))
+    labels = Labels((640, 360), [(0, 0, 200, 60)], [(0, 0, 200, 60)], 16)
+    at = [(300, 200), (302, 203), (305, 199), (100, 30), (320, 350), (636, 100), (900, 100)]
+    drawn = labels.draw(image, [Label(np.array(p, float), f"name {k}", (255, 0, 0), "A+B")
+                                for k, p in enumerate(at)])
+    assert drawn == 5, "one lies behind the list, one out of the picture"
+    for k, a in enumerate(labels.taken):
+        assert a[0] >= 0
+        assert a[2] <= 640
+        for b in labels.taken[k + 1:]:
+            assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
+
+
 class Plain:
     """Views without OpenGL: one colour."""
 
-    def main(self, moment, qpos):
-        return np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
-
-    def close(self, moment, qpos, robot):
-        return np.full((films.CLOSE[1], films.CLOSE[0], 3), 90, np.uint8)
+    def seen(self, shot, share, moment, qpos):
+        return Seen(np.full((720, 1280, 3), 60, np.uint8), [], [])
 
 
 @pytest.mark.parametrize("robots", [1, 3, 8])
@@ -96,14 +181,11 @@ def test_every_robot_has_its_place_in_the_strip_and_every_target_in_the_list(
     spec = mission([f"r{i} {kinds[i % 3]} A {i} 0" for i in range(robots)],
                    [f"A OR {i % 8} {1 + i // 8}" for i in range(16)], size=(8, 8), max_steps=1)
     done = execute(spec, script(" ".join(["up"] * robots)))
-    ground = Ground(np.zeros((33, 33)), 0.25)
-    film = Film(spec, done.record, Frame((8, 8), 1.0), ground, range(0, 7 * robots, 7), "test",
-                views=Plain())
-    picture = film.picture(1.0).astype(int)
-    strip = picture[HEIGHT - films.CLOSE[1]:HEIGHT - 20]
-    framed = (strip == 90).all(axis=(0, 2))  # columns that show nothing but a close view
-    borders = np.count_nonzero(np.diff(framed.astype(int)) == 1)
-    assert borders >= robots, "a close view a robot"
-    pen = ImageDraw.Draw(Image.new("RGB", (WIDTH, HEIGHT)), "RGBA")
-    end = film._target_list(pen, film.moment(1.0), (650, 208), films.FREE[3])
-    assert end <= films.FREE[3], "the list ends above a strip that reaches under it"
+    film = Film(take_of(spec, done.record, range(0, 7 * robots, 7), 8), views=Plain())
+    boxes = film._strip(Image.new("RGB", (1280, 720)), film.moment(0.5))
+    assert len(boxes) == robots
+    assert boxes[-1][2] <= 1280
+    end = film._target_list(Image.new("RGB", (1280, 720)), film.moment(0.5), (1030, 260))
+    assert end <= boxes[0][1], "the list ends above the strip"
+    middle = film.shots[1]
+    assert film.picture(film.shots[0].frames + middle.frames // 2).std() > 4
