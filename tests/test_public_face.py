@@ -102,7 +102,7 @@ def test_plan_follows_the_clock(capsys):
     (lambda: moonteam.rollout("outpost", backnd="native"), "did you mean backend"),
     (lambda: moonteam.evaluate("3x5", decod="argmax"), "did you mean decode"),
     (lambda: moonteam.train("smal"), "small"),
-    (lambda: moonteam.train("small", sed=1), "--sed 1: not understood"),
+    (lambda: moonteam.train("small", sed=1), "no such option; did you mean --seed"),
     (lambda: moonteam.make("MoonGrid"), "did you mean MoonGrid-v0"),
     (lambda: moonteam.make("MoonGrid-v0", confg="pi_5t"), "did you mean config"),
     (lambda: moonteam.make("MoonGrid-v0", config="pi_5"), "pi_5t"),

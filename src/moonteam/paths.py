@@ -35,4 +35,5 @@ def find(name: str, folder: str, suffix: str) -> Path:
 
 def bundled_names(folder: str, suffix: str) -> list[str]:
     """Of the bundled assets of one kind, by which `find` knows them."""
-    return sorted(p.stem for p in (assets() / folder).glob(f"*{suffix}"))
+    top = assets() / folder
+    return sorted(p.relative_to(top).with_suffix("").as_posix() for p in top.rglob(f"*{suffix}"))

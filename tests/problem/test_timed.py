@@ -106,7 +106,7 @@ def test_a_mission_by_the_clock_is_read(tmp_path):
 @pytest.mark.parametrize(("old", "new", "says"), [
     ("clock: seconds\n", "", "robots[0].home: is for missions by the clock"),
     ("clock: seconds", "clock: hours", "clock"),
-    ("after: [core]", "after: [corn]", "targets[1].after: 'corn' is not allowed; other"),
+    ("after: [core]", "after: [corn]", "after: 'corn' is not allowed; did you mean core"),
     ("after: [core]", "after: [look]", "targets[1].after: 'look' is not allowed"),
     ("service: 8", "service: 8, after: [look]", "targets[0].after: it would come before itself"),
     ("drill: 2", "drill: 3", "targets[0].coalition.drill: 3 robots with it are needed; the team"),
