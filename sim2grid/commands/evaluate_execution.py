@@ -55,7 +55,7 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
       moonteam evaluate execution --backend native mjx --count 10 --out runs/backends
       moonteam evaluate execution --count 20 --new-targets 5 --slow 0.5 --silent 0.5 --json
       moonteam evaluate execution --mission outpost my_mission.yaml --planner exact policy
-      moonteam evaluate execution --team drone:A,my_rover.py:ROVER:AB --planner my.py:Planner
+      moonteam evaluate execution --team scout.py:SCOUT:A,rover.py:ROVER:AB --planner my.py:Planner
       moonteam evaluate execution --dem moon.tif --units degrees --centre -89.4 222 --side 24
       moonteam evaluate execution --count 500 --on ray://head:10001 --out runs/many
     """
@@ -63,9 +63,9 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     mission: tuple[str, ...] = ()
     """Mission files or names of bundled missions, each executed once, in place of random ones."""
     team: str = ""
-    """The robots of random missions, KIND or KIND:SKILLS, with commas: drone:A,wheeled:AB or
-    rover.py:ROVER:drill+camera. Kinds are registered or FILE.py:OBJECT; skills that are left out
-    are drawn."""
+    """The robots of random missions, KIND or KIND:SKILLS, with commas, such as
+    scout.py:SCOUT:A,rover.py:ROVER:drill+camera. Kinds are registered or FILE.py:OBJECT; skills
+    that are left out are drawn."""
     site: tuple[Literal["mare", "highland", "crater_rim", "polar", "flat"], ...] = ("mare",)
     """Presets of the ground, one group of missions each; without --dem."""
     count: int = 20

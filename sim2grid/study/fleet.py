@@ -181,7 +181,7 @@ def _skills(said: str, part: str) -> tuple[str, ...]:
         if not skill.replace("_", "").replace("-", "").isalnum() or found.count(skill) > 1:
             raise InputError("--team", f"{part.strip()!r} is not allowed; KIND or KIND:SKILLS, "
                              "skills as letters A to H or names joined by +, each once, such as "
-                             "drone:A,wheeled:AB or rover.py:ROVER:drill+camera")
+                             "scout.py:SCOUT:A,rover.py:ROVER:drill+camera")
     return found or _skills("?", part)
 
 
