@@ -227,6 +227,7 @@ def test_macro_decisions_on_the_bench(monkeypatch):
         macro.measure(measure.Wanted("quick", num_envs=4), "")
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(find_spec("jaxmarl") is None, reason="importing it here would end capsys")
 def test_macro_decisions_beside_the_loop(checkout, capsys):
     """The process of our side has the presets as they ship, so this compiles quick."""

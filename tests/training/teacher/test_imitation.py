@@ -68,7 +68,8 @@ def test_learning_lowers_the_loss():
     assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
 
 
-@pytest.mark.parametrize("family", [SMALL, Family(3, 2, sides=(6, 6), max_steps=24, grounds=3)],
+@pytest.mark.parametrize("family", [SMALL, pytest.param(
+    Family(3, 2, sides=(6, 6), max_steps=24, grounds=3), marks=pytest.mark.soak)],
                          ids=["open", "blocked"])
 def test_a_resumed_run_is_the_same_run(tmp_path, family, monkeypatch):
     monkeypatch.setattr(pupil, "SCENARIOS", 8)

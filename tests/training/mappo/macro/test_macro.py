@@ -152,6 +152,7 @@ def test_training_learns(advantages):
     assert after["makespan_gap"] < before["makespan_gap"]
 
 
+@pytest.mark.soak
 def test_programs_compiled_side_by_side_train_to_the_same_bits():
     """Ahead of time in threads, or one after the other as each is first called."""
     config = dataclasses.replace(TINY, families=(*TINY.families, Practice("open", SMALL)))
