@@ -33,7 +33,9 @@ from sim2grid.loop.asked import Asked, Body
 from sim2grid.loop.known import Known
 from sim2grid.loop.logbook import Logbook, cell_of
 from sim2grid.loop.record import (
+    GOING_ON,
     LOSSES,
+    SETTING_OUT,
     Decision,
     FailureCause,
     Leg,
@@ -281,9 +283,9 @@ class TimedExecution:
         errand, book, frame = self.errands[robot], self.book, self.asked.frame
         goal, xy = errand.points[1], self.known.xy[robot]
         expected = float(errand.legs[0])
-        leg = Leg(robot, book.decision, 5 if first else 4, cell_of(frame.cell(xy)),
-                  cell_of(frame.cell(goal)), xy.copy(), goal.copy(), book.time,
-                  errand.watched + WATCH_S, expected_s=expected)
+        leg = Leg(robot, book.decision, SETTING_OUT if first else GOING_ON,
+                  cell_of(frame.cell(xy)), cell_of(frame.cell(goal)), xy.copy(), goal.copy(),
+                  book.time, errand.watched + WATCH_S, expected_s=expected)
         book.legs[robot] = leg
         book.points[robot] = errand.place
         self.record.legs.append(leg)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,11 +21,8 @@ if TYPE_CHECKING:
     from sim2grid.study.evaluation import Evaluation, Row
     from sim2grid.study.fleet import Given, Recipe
 
-PRESETS = ("mare", "highland", "crater_rim", "polar", "flat")
-
 DRAWN = ("team", "site", "count", "cell", "lose", "slow", "silent", "new_targets", "impassable",
-         "site_seed", "targets", "side", "max_steps", "dem", "centre", "units", "rotation", "pixel",
-         "band", "scale", "detrend", "detail")
+         "site_seed", "targets", "side", "max_steps", *(field.name for field in fields(Elevation)))
 """Options of random missions, which a mission that is given answers itself."""
 
 FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")

@@ -176,9 +176,7 @@ class MoonMission(Face):
             missing(problem, seen.choice)], axis=1)
         told = jnp.where(open_[:, None], told, 0.0).reshape(-1)
         left = units(problem.limit)[None]
-        return self._observed(jnp.stack([
-            jnp.concatenate([rows[i], jnp.delete(rows, i, axis=0).reshape(-1), told, left])
-            for i in range(self.num_agents)]))
+        return self._observed(self._own_first(rows, told, left))
 
     @partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: MissionState) -> ByAgent:

@@ -32,6 +32,9 @@ LOSSES: dict[int, LossCause] = {
 
 XY = npt.NDArray[np.float64]  # [2] m
 
+SETTING_OUT, GOING_ON = 5, 4
+"""Actions of legs by the clock: the first piece of a way, and the others."""
+
 
 @dataclass
 class Leg:
@@ -39,7 +42,7 @@ class Leg:
 
     robot: int
     decision: int
-    action: int  # 0..4, as the planner asked; by the clock 5 on the first piece of a way, else 4
+    action: int  # 0..4, as the planner asked; by the clock SETTING_OUT or GOING_ON
     from_cell: Cell
     goal_cell: Cell  # from_cell where it stays or the way is barred
     start_xy: XY  # where it truly stood

@@ -30,11 +30,13 @@ from moonteam.physics.render import SHOWN_GROUPS
 from moonteam.problem.scenario import ACTIONS
 from moonteam.robots.base import RobotKind
 from moonteam.terrain.site import Site
+from sim2grid.clock.errand import HOME, WAIT
 from sim2grid.loop.prepare import Prepared
-from sim2grid.loop.record import Leg
+from sim2grid.loop.record import SETTING_OUT, Leg
 from sim2grid.measure.slip import ground_height, slip
 from sim2grid.measure.story import Story
-from sim2grid.show.picture import OPEN, REPLAN, SOLVED, STATES, Color, requirement, robot_color
+from sim2grid.show.picture import OPEN, REPLAN, SOLVED, STATES, requirement, robot_color
+from sim2grid.show.plots import hexed
 
 LARGEST = 6_000_000
 """Bytes of the page that the replay may take, library included."""
@@ -51,7 +53,6 @@ SLIP_EVERY, SLIP_WINDOW = 0.5, 4.0
 LIBRARY = ("three.module.min.js", "OrbitControls.js")
 """three.js 0.170.0 as npm has it (`npm pack three@0.170.0`), to the byte."""
 
-HOME, WAIT = -2, -1
 GEOM = mujoco.mjtGeom
 SHAPES = {int(GEOM.mjGEOM_SPHERE): "sphere", int(GEOM.mjGEOM_CAPSULE): "capsule",
           int(GEOM.mjGEOM_ELLIPSOID): "ellipsoid", int(GEOM.mjGEOM_CYLINDER): "cylinder",
@@ -132,18 +133,14 @@ def mission_data(story: Story, prepared: Prepared, rate: float) -> str:
     head = {
         "seconds": story.record.seconds(), "half": half, "cell": frame.cell_m,
         "sun": [look.SUN_AZIMUTH, look.SUN_ELEVATION],
-        "colours": {"open": _hex(OPEN), "solved": _hex(SOLVED), "replan": _hex(REPLAN),
-                    "serving": _hex(STATES["late"])},
+        "colours": {"open": hexed(OPEN), "solved": hexed(SOLVED), "replan": hexed(REPLAN),
+                    "serving": hexed(STATES["late"])},
         "ground": _ground(site, prepared.barred(), half, frame.cell_m, block),
         "boulders": [_boulder(b, block) for b in site.boulders[:MOST_BOULDERS]],
         **_bodies(prepared, block), "poses": _poses(story, rate, block),
         "robots": [_robot(story, prepared, i, block) for i in range(len(prepared.bodies))],
         "targets": _targets(story), "events": _events(story)}
     return block.text(head)
-
-
-def _hex(color: Color) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*color)
 
 
 def quantised(values: npt.NDArray, block: Block) -> dict[str, Any]:
@@ -264,7 +261,7 @@ def _robot(story: Story, prepared: Prepared, i: int, block: Block) -> dict[str, 
     legs = [leg for leg in story.record.legs if leg.robot == i]
     return {
         "name": spec.name, "kind": spec.kind, "skills": list(spec.skills),
-        "colour": _hex(robot_color(i)), "base": prepared.bodies[i].base,
+        "colour": hexed(robot_color(i)), "base": prepared.bodies[i].base,
         "flies": robot.kind.flies, "footprint": robot.kind.footprint,
         "lost": None if loss is None else [round(loss.time_s, 3), loss.cause.replace("_", " ")],
         "legs": [_leg(leg) for leg in legs], "choices": _choices(story, i, legs),
@@ -274,8 +271,8 @@ def _robot(story: Story, prepared: Prepared, i: int, block: Block) -> dict[str, 
 
 def _leg(leg: Leg) -> list[Any]:
     return [round(leg.start_s, 3), None if leg.end_s is None else round(leg.end_s, 3), leg.ended,
-            leg.moving or leg.action == 5, *(round(float(v), 3) for v in
-                                             (*leg.start_xy, *leg.waypoint))]
+            leg.moving or leg.action == SETTING_OUT,
+            *(round(float(v), 3) for v in (*leg.start_xy, *leg.waypoint))]
 
 
 def _choices(story: Story, i: int, legs: list[Leg]) -> list[tuple[float, str]]:

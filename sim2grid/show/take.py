@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from moonteam.problem.mission import Mission
 from sim2grid.frame import Frame
-from sim2grid.loop.record import Record
+from sim2grid.loop.record import SETTING_OUT, Record
 from sim2grid.show.picture import Ground
 
 if TYPE_CHECKING:
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from sim2grid.loop.prepare import Prepared
 
 Layout = Literal["inset", "clean", "map"]
-
-SETTING_OUT = 5
-"""The action that begins a way by the clock, see `sim2grid.loop.record.Leg`."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 from sim2grid.show import plots
 from sim2grid.show.page import Raw, folded, known, mean_interval, page, plot, table, tiles
 from sim2grid.study.mission_cards import cards, optimum, rollout_command
-from sim2grid.study.summary import COMPARED, DIFFERENT, compared_rows, different_rows
+from sim2grid.study.summary import COMPARED, DIFFERENT, compared_rows, different_rows, where
 
 MOST_FAILURES = 200
 """Failed missions that the page lists one by one; report.json has all."""
@@ -60,7 +60,7 @@ def summary_table(document: dict[str, Any]) -> str:
     best = best_means(document)
     for line in document["summary"]:
         found = [_spread(line, key, digits) for key, _, digits in COLUMNS]
-        lines.append([f"{line['site']} {line['site_seed']}", Raw(
+        lines.append([where(line), Raw(
             f"<b>{html.escape(line['contender'])}</b>"),
             f"{line['solved']} of {line['missions']}", *found, line.get("planned"),
             best.get((line["site"], line["site_seed"], line["contender"])), line["falls"],
@@ -90,7 +90,7 @@ def intervals_plot(document: dict[str, Any]) -> str:
     """The summary's main figures, drawn."""
     lines = document["summary"]
     many = len({(line["site"], line["site_seed"]) for line in lines}) > 1
-    names = [line["contender"] + (f", {line['site']} {line['site_seed']}" if many else "")
+    names = [line["contender"] + (f", {where(line)}" if many else "")
              for line in lines]
     panels = [(title, [mean_interval(line, key) for line in lines]) for key, title in FIGURES]
     panels = [panel for panel in panels if any(panel[1])]
@@ -116,7 +116,7 @@ def causes_table(document: dict[str, Any], source: str) -> str:
             shown = ", ".join(
                 f'<span title="{html.escape(rollout_command(source, group | {"number": n}))}">'
                 f"{n}</span>" for n in numbers)
-            lines.append([f"{group['site']} {group['site_seed']}", group["contender"], cause,
+            lines.append([where(group), group["contender"], cause,
                           len(numbers), Raw(shown)])
     return table(["site", "contender", "cause", "missions", "numbers"], lines) if lines else ""
 
@@ -130,7 +130,7 @@ def failures_table(document: dict[str, Any], source: str) -> str:
         report = row["report"]
         command = rollout_command(source, row)
         lines.append([
-            row["number"], f"{row['site']} {row['site_seed']}", row["contender"],
+            row["number"], where(row), row["contender"],
             (report["cause"] or "").replace("_", " "), report["detail"], report["seconds"],
             Raw(f"<code>{html.escape(command)}</code>") if row["contender"] in physical else None])
     more = len(failed) - MOST_FAILURES
@@ -148,7 +148,7 @@ def histogram_plots(document: dict[str, Any]) -> str:
         for row in document["rows"]:
             value = read(row) if row["report"]["success"] else None
             if value is not None:
-                site = f", {row['site']} {row['site_seed']}" if many else ""
+                site = f", {where(row)}" if many else ""
                 groups.setdefault(row["contender"] + site, []).append(value)
         return groups
 

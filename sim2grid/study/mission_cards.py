@@ -22,7 +22,7 @@ from PIL import Image
 
 from moonteam import files
 from moonteam.errors import InputError
-from moonteam.problem.mission import Mission, Target
+from moonteam.problem.mission import Map, Mission, Site, Target
 from moonteam.terrain.site import for_mission
 from sim2grid.show.page import Raw, known
 from sim2grid.show.picture import (
@@ -70,12 +70,11 @@ def cards(document: dict[str, Any], source: str) -> str:
     for row in document["rows"]:
         rows.setdefault(row["number"], []).append(row)
     physical = {c["name"] for c in document["contenders"] if c["loop"] != "grid"}
-    grounds: dict[tuple[Any, ...], str] = {}
+    grounds: dict[tuple[Site, Map], str] = {}
     symbols, shown = [], []
     for entry in entries:
         mission = msgspec.convert(entry["mission"], Mission)
-        site = (mission.site.preset, mission.site.dem, mission.site.seed, mission.map.size,
-                mission.map.cell_m)
+        site = mission.site, mission.map
         if site not in grounds:
             grounds[site] = f"ground{len(grounds)}"
             symbols.append(_ground(mission, grounds[site]))

@@ -32,7 +32,7 @@ def load(source: str | os.PathLike[str]
     path = Path(name)
     head, colon, which = name.rpartition(":")
     if colon and not path.is_file() and path.suffix not in YAML:
-        return pick(paths.find(head, "testsets", ".jsonl"), which)
+        return pick(paths.find(head, *SETS), which)
     if path.suffix == ".jsonl":
         return load_set(path)
     if path.suffix in YAML or (not path.suffix and not path.is_file()):

@@ -21,6 +21,7 @@ import tyro
 
 from moonteam import outputs
 from moonteam.commands import refused
+from moonteam.problem.piece import Units
 from moonteam.report.command import Aside
 
 if TYPE_CHECKING:
@@ -180,7 +181,7 @@ class Elevation:
     with north first."""
     centre: tuple[float, float] | None = None
     """Of the window in --dem, in --units; the model's centre if not given."""
-    units: Literal["metres", "pixels", "degrees"] = "metres"
+    units: Units = "metres"
     """What --centre is in: metres east and north of the model's centre, column and row of pixels
     counted from 0 in the upper left, or latitude and longitude."""
     rotation: float = 0.0

@@ -154,6 +154,12 @@ class Face:
         whole = {"world_state": observation.reshape(-1)} if self._world_state else {}
         return self._split(observation) | whole
 
+    def _own_first(self, rows: Array, *shared: Array) -> Array:
+        """[N, D]: each agent's row [N, F], then the others' by index, then what all see [..]."""
+        return jnp.stack([
+            jnp.concatenate([rows[i], jnp.delete(rows, i, axis=0).reshape(-1), *shared])
+            for i in range(self.num_agents)])
+
     def _joint(self, actions: ByAgent) -> Array:
         """[N] int32. JaxMARL's recurrent MAPPO hands each agent an action of shape [1]."""
         return jnp.stack([jnp.reshape(jnp.asarray(actions[agent]), ()).astype(jnp.int32)

@@ -95,9 +95,7 @@ class MoonMacro(Face):
             units(problem.appears - state.now)[:, None],
             world.missing(problem, state.goal)], axis=1)
         told = jnp.where(open_[:, None], told, 0.0).reshape(-1)
-        return self._observed(jnp.stack([
-            jnp.concatenate([rows[i], jnp.delete(rows, i, axis=0).reshape(-1), told])
-            for i in range(self.num_agents)]))
+        return self._observed(self._own_first(rows, told))
 
     @partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: MacroState) -> ByAgent:

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import jax.numpy as jnp
 import mujoco
@@ -50,8 +50,82 @@ class Marker:
     glow: float = 0.0  # light of its own, 0 to 1
 
 
-class Renderer:
-    """Draws a scene. Use as a context manager, or call `close`.
+class Canvas:
+    """A compiled model with an off-screen window to draw it in, and what is drawn over it.
+
+    Use as a context manager, or call `close`. Raises RenderingUnavailable.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, most_geoms: int):
+        self.model, self.width, self.height = model, width, height
+        self._data = mujoco.MjData(model)
+        self._window = open_window(width, height)
+        atexit.register(self.close)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._drawn = mujoco.MjvScene(model, most_geoms)
+        for flag in ("REFLECTION", "HAZE"):
+            self._drawn.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
+        self._option = mujoco.MjvOption()
+        self._option.label = mujoco.mjtLabel.mjLABEL_NONE
+        self._option.flags[:] = False
+        self._option.flags[mujoco.mjtVisFlag.mjVIS_TEXTURE] = True
+        self._option.flags[mujoco.mjtVisFlag.mjVIS_STATIC] = True
+
+    @property
+    def _port(self) -> mujoco.MjrRect:
+        """The whole picture."""
+        return mujoco.MjrRect(0, 0, self.width, self.height)
+
+    def _take(self, qpos: Points) -> None:
+        """Takes a pose qpos [nq], lights and cameras with it, in this window."""
+        self._window.make_current()
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self._data)
+        mujoco.mj_comPos(self.model, self._data)  # lights and cameras need it
+        mujoco.mj_camlight(self.model, self._data)
+
+    def _update(self, camera: mujoco.MjvCamera) -> None:
+        """The scene anew, with nothing drawn over it."""
+        mujoco.mjv_updateScene(self.model, self._data, self._option, None, camera,
+                               mujoco.mjtCatBit.mjCAT_ALL, self._drawn)
+
+    def _draw(self, marker: Marker) -> None:
+        geom = self._next()
+        if geom is None:
+            return
+        mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size, np.float64),
+                            np.asarray(marker.position, np.float64),
+                            np.asarray(marker.matrix, np.float64).ravel(),
+                            np.array(marker.rgba, np.float32))
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        geom.emission = marker.glow
+        geom.label = marker.label
+
+    def _next(self) -> mujoco.MjvGeom | None:
+        """The scene's next geom; None where it is full."""
+        if self._drawn.ngeom >= self._drawn.maxgeom:
+            return None
+        self._drawn.ngeom += 1
+        return self._drawn.geoms[self._drawn.ngeom - 1]
+
+    def close(self) -> None:
+        """Frees the window; harmless twice. Without it Python may complain on exit."""
+        atexit.unregister(self.close)
+        for part in ("_context", "_window"):
+            held = self.__dict__.pop(part, None)
+            if held is not None:
+                held.free()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class Renderer(Canvas):
+    """Draws a scene.
 
     Args:
       scene: what to draw.
@@ -70,28 +144,15 @@ class Renderer:
         look.decorate(spec, scene.site)
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         spec.visual.quality.offsamples = samples
-        self.scene, self.width, self.height = scene, width, height
-        self._model = spec.compile()
-        set_heights(self._model, scene.site.heights)
-        look.mesh_offsets(self._model, scene.site)
-        self._data = mujoco.MjData(self._model)
-        self._follow_shadow = shadow_reach > 0.0
+        model = spec.compile()
+        set_heights(model, scene.site.heights)
+        look.mesh_offsets(model, scene.site)
+        self.scene, self._follow_shadow = scene, shadow_reach > 0.0
         if self._follow_shadow:
-            self._model.vis.map.shadowclip = shadow_reach / self._model.stat.extent
-        self._window = open_window(width, height)
-        atexit.register(self.close)
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._drawn = mujoco.MjvScene(self._model, MAX_GEOMS)
+            model.vis.map.shadowclip = shadow_reach / model.stat.extent
+        super().__init__(model, width, height, MAX_GEOMS)
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._drawn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._drawn.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
-        self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = SHOWN_GROUPS
-        self._option.label = mujoco.mjtLabel.mjLABEL_NONE
-        self._option.flags[:] = False
-        self._option.flags[mujoco.mjtVisFlag.mjVIS_TEXTURE] = True
-        self._option.flags[mujoco.mjtVisFlag.mjVIS_STATIC] = True
 
     def frame(self, qpos: Points, camera: mujoco.MjvCamera | None = None,
               markers: Sequence[Marker] = (), words: str = "") -> npt.NDArray[np.uint8]:
@@ -99,54 +160,21 @@ class Renderer:
 
         Without a camera: one that sees all robots.
         """
-        self._window.make_current()
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)  # lights and cameras need it
-        mujoco.mj_camlight(self._model, self._data)
+        self._take(qpos)
         seen = camera or overview(self.scene, qpos, aspect=self.width / self.height)
         if self._follow_shadow:
             sun = self._data.light_xdir[0]
             self._data.light_xpos[0] = np.asarray(seen.lookat) - look.SUN_DISTANCE * sun
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, seen,
-                               mujoco.mjtCatBit.mjCAT_ALL, self._drawn)
+        self._update(seen)
         for marker in markers:
             self._draw(marker)
-        port = mujoco.MjrRect(0, 0, self.width, self.height)
-        mujoco.mjr_render(port, self._drawn, self._context)
+        mujoco.mjr_render(self._port, self._drawn, self._context)
         if words:
             mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT,
-                               port, words, "", self._context)
+                               self._port, words, "", self._context)
         picture = np.empty((self.height, self.width, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, port, self._context)
+        mujoco.mjr_readPixels(picture, None, self._port, self._context)
         return picture[::-1]
-
-    def close(self) -> None:
-        """Frees the window; harmless twice. Without it Python may complain on exit."""
-        atexit.unregister(self.close)
-        for part in ("_context", "_window"):
-            held = self.__dict__.pop(part, None)
-            if held is not None:
-                held.free()
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def _draw(self, marker: Marker) -> None:
-        if self._drawn.ngeom >= self._drawn.maxgeom:
-            return
-        geom = self._drawn.geoms[self._drawn.ngeom]
-        mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size, np.float64),
-                            np.asarray(marker.position, np.float64),
-                            np.asarray(marker.matrix, np.float64).ravel(),
-                            np.array(marker.rgba, np.float32))
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-        geom.emission = marker.glow
-        geom.label = marker.label
-        self._drawn.ngeom += 1
 
 
 def overview(

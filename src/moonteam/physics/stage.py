@@ -10,7 +10,6 @@ A stage needs the compiled model alone, so it can live in another process than t
 
 from __future__ import annotations
 
-import atexit
 import functools
 import math
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.physics import look
-from moonteam.physics.render import SHOWN_GROUPS, Color, Marker, open_window
+from moonteam.physics.render import SHOWN_GROUPS, Canvas, Color, Marker, open_window
 from moonteam.physics.scene import Scene, set_heights
 
 MAX_GEOMS = 6000
@@ -76,9 +75,8 @@ class View:
 
         `size`: width and height. Behind the camera the depth is not above 0.
         """
-        right, up, depth = (np.asarray(points, float) - self.eye) @ self.axes[0], (
-            np.asarray(points, float) - self.eye) @ self.axes[1], (
-            np.asarray(points, float) - self.eye) @ self.axes[2]
+        offset = np.asarray(points, float) - self.eye
+        right, up, depth = (offset @ axis for axis in self.axes)
         scale = size[1] / 2 / math.tan(math.radians(self.fovy) / 2) / np.maximum(depth, 1e-6)
         return np.stack([size[0] / 2 + right * scale, size[1] / 2 - up * scale], -1), depth
 
@@ -105,34 +103,20 @@ class Line:
     width: float
 
 
-class Stage:
-    """Draws a painted model. Use as a context manager, or call `close`.
-
-    Raises RenderingUnavailable.
-    """
+class Stage(Canvas):
+    """Draws a painted model. Raises RenderingUnavailable."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
         model.vis.global_.offwidth = max(width, SUN_PIXELS)
         model.vis.global_.offheight = max(height, SUN_PIXELS)
         model.vis.quality.offsamples = 0
         model.vis.quality.shadowsize = 0
-        self.model, self.width, self.height = model, width, height
-        self._data = mujoco.MjData(model)
-        self._window = open_window(width, height)
-        atexit.register(self.close)
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        super().__init__(model, width, height, MAX_GEOMS)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        self._drawn = mujoco.MjvScene(model, MAX_GEOMS)
         self._groups = model.geom_group.copy()
         self._roots = model.body_rootid[model.geom_bodyid]
-        for flag in ("SHADOW", "REFLECTION", "HAZE", "FOG"):
+        for flag in ("SHADOW", "FOG"):
             self._drawn.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
-        self._option = mujoco.MjvOption()
-        self._option.label = mujoco.mjtLabel.mjLABEL_NONE
-        self._option.flags[:] = False
-        self._option.flags[mujoco.mjtVisFlag.mjVIS_TEXTURE] = True
-        self._option.flags[mujoco.mjtVisFlag.mjVIS_STATIC] = True
         sun = look.sunward(look.LOW_SUN)
         aside = np.cross([0.0, 0.0, 1.0], sun)
         aside /= np.linalg.norm(aside)
@@ -145,11 +129,7 @@ class Stage:
 
         `casters`: whose shadows are wanted.
         """
-        self._window.make_current()
-        self._data.qpos[:] = np.nan_to_num(qpos)
-        mujoco.mj_kinematics(self.model, self._data)
-        mujoco.mj_comPos(self.model, self._data)  # lights and cameras need it
-        mujoco.mj_camlight(self.model, self._data)
+        self._take(np.nan_to_num(qpos))
         size = (self.width, self.height)
         boxes = [_screen_box(view, size, caster, self._sun) for caster in casters]
         seen = [None if box is None else self._from_the_sun(caster)
@@ -160,11 +140,10 @@ class Stage:
         for line in lines:
             self._draw_line(line)
         self._aim(view.eye, view.axes[2], view.axes[1], math.radians(view.fovy))
-        port = mujoco.MjrRect(0, 0, self.width, self.height)
-        mujoco.mjr_render(port, self._drawn, self._context)
+        mujoco.mjr_render(self._port, self._drawn, self._context)
         picture = np.empty((self.height, self.width, 3), np.uint8)
         raw = np.empty((self.height, self.width), np.float32)
-        mujoco.mjr_readPixels(picture, raw, port, self._context)
+        mujoco.mjr_readPixels(picture, raw, self._port, self._context)
         picture, depth = picture[::-1].copy(), _metres(raw[::-1])
         for caster, box, shade in zip(casters, boxes, seen, strict=True):
             if box is not None and shade is not None:
@@ -181,20 +160,6 @@ class Stage:
         self._data.qpos[:] = np.nan_to_num(qpos)
         mujoco.mj_kinematics(self.model, self._data)
 
-    def close(self) -> None:
-        """Frees the window; harmless twice."""
-        atexit.unregister(self.close)
-        for part in ("_context", "_window"):
-            held = self.__dict__.pop(part, None)
-            if held is not None:
-                held.free()
-
-    def __enter__(self) -> Stage:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def _scene(self, every: bool, body: int = 0) -> None:
         """Everything, or what moves alone; of that a root body's part where one is given."""
         self._option.geomgroup[:] = 0
@@ -205,8 +170,7 @@ class Stage:
         self._drawn.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = every
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        mujoco.mjv_updateScene(self.model, self._data, self._option, None, camera,
-                               mujoco.mjtCatBit.mjCAT_ALL, self._drawn)
+        self._update(camera)
 
     def _aim(self, eye: Floats, forward: Floats, up: Floats, fovy: float, flat: float = 0.0
              ) -> None:
@@ -269,30 +233,17 @@ class Stage:
         kept = 1.0 - np.float32(1.0 - 2.0 * look.SHADE) * dark[rows, columns]
         part[rows, columns] = (part[rows, columns] * kept[:, None]).astype(np.uint8)
 
-    def _draw(self, marker: Marker) -> None:
-        if self._drawn.ngeom >= self._drawn.maxgeom:
-            return
-        geom = self._drawn.geoms[self._drawn.ngeom]
-        mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size, np.float64),
-                            np.asarray(marker.position, np.float64),
-                            np.asarray(marker.matrix, np.float64).ravel(),
-                            np.array(marker.rgba, np.float32))
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-        geom.emission = marker.glow
-        self._drawn.ngeom += 1
-
     def _draw_line(self, line: Line) -> None:
         kind, width = mujoco.mjtGeom.mjGEOM_LINE, line.width
         nothing, turn = np.zeros(3), np.eye(3).ravel()
         rgba = np.array(line.rgba, np.float32)
         for start, end in np.asarray(line.pieces, np.float64):
-            if self._drawn.ngeom >= self._drawn.maxgeom:
+            geom = self._next()
+            if geom is None:
                 return
-            geom = self._drawn.geoms[self._drawn.ngeom]
             mujoco.mjv_initGeom(geom, kind, nothing, nothing, turn, rgba)
             mujoco.mjv_connector(geom, kind, width, start, end)
             geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-            self._drawn.ngeom += 1
 
 
 SUN_NEAR, SUN_FAR = 0.5, 20.0  # m from the eye in the sun to what it sees first, to the middle

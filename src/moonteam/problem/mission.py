@@ -65,7 +65,7 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
         return Piece(self.size, self.centre, self.units, self.rotation)
 
 
-MODEL_ONLY = ("centre", "size", "units", "rotation", "pixel", "band", "scale", "detrend", "detail")
+MODEL_ONLY = tuple(key for key in Site.__struct_fields__ if key not in ("preset", "dem", "seed"))
 """Keys of a site that mean nothing without a dem."""
 
 

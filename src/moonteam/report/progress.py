@@ -40,14 +40,15 @@ class Pace:
     def __init__(self, total: int, done: int,
                  clock: Callable[[], float] = compilation.working_time):
         self._total, self._first, self._clock = total, done, clock
-        self._begun = clock()
+        self.begun = clock()
 
-    def left(self, done: int) -> float | None:
+    def left(self, done: int, now: float | None = None) -> float | None:
         """Seconds left, with so much done by now; None where nothing tells."""
         made = done - self._first
         if made <= 0:
             return None
-        return max(self._total - done, 0) * (self._clock() - self._begun) / made
+        now = self._clock() if now is None else now
+        return max(self._total - done, 0) * (now - self.begun) / made
 
 
 def hours(seconds: float | None) -> str:
@@ -84,7 +85,8 @@ def bar(title: str, total: int, done: int = 0, *, plain_s: float = 0.0
 
 def _plain(title: str, total: int, behind: int, every_s: float) -> Callable[[int, str], None]:
     """Lines such as "moonteam: video 210 of 720, about 0:31 left"."""
-    begun = said = time.monotonic()
+    pace = Pace(total, behind, time.monotonic)
+    said = pace.begun
 
     def update(done: int, words: str) -> None:
         nonlocal said
@@ -92,10 +94,8 @@ def _plain(title: str, total: int, behind: int, every_s: float) -> Callable[[int
         if now - said < every_s:
             return
         said = now
-        left = ""
-        if behind < done < total:
-            seconds = round((total - done) * (now - begun) / (done - behind))
-            left = f", about {seconds // 60}:{seconds % 60:02d} left"
+        rest = pace.left(done, now) if done < total else None
+        left = "" if rest is None else f", about {round(rest) // 60}:{round(rest) % 60:02d} left"
         more = " ".join(words.split())
         print(f"moonteam: {title} {done} of {total}{left}" + (f" ({more})" if more else ""),
               file=sys.stderr, flush=True)

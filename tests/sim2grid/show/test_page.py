@@ -15,6 +15,7 @@ from sim2grid.measure.story import Story
 from sim2grid.show import page, plots
 from sim2grid.show.picture import ROBOTS, Ground
 from sim2grid.study.evaluation_page import best_means, evaluation_page
+from sim2grid.study.fleet import GIVEN
 from sim2grid.study.mission_cards import optimum
 from tests.browser import needs_chromium, visit
 
@@ -186,6 +187,22 @@ def test_every_mission_has_a_map_a_gantt_and_its_film_on_demand(clocked):
     assert "b<</text>" not in text
     for mark in ("plan: 30.0 s", "optimum: 20.0 s", "planned 7.5 s", "T2 solved at 33.0 s"):
         assert mark in read.text
+
+
+def test_missions_on_two_pieces_of_one_model_have_a_ground_each(clocked):
+    """Here it is not to be had, so each is grey."""
+    for entry, centre in zip(clocked["missions"], ([3, 4], [9, 4]), strict=True):
+        entry["mission"] = MISSION | {"site": {"dem": "none.tif", "centre": centre}}
+    text = evaluation_page(clocked)
+    assert [text.count(f'href="#ground{k}"') for k in range(3)] == [2, 1, 0]
+
+
+def test_missions_that_were_given_have_no_seed_of_a_ground(document):
+    for part in ("summary", "failures", "rows"):
+        document[part] = [one | {"site": GIVEN} for one in document[part]]
+    text = Reader(evaluation_page(document)).text
+    assert GIVEN in text
+    assert f"{GIVEN} 0" not in text
 
 
 def test_the_optimum_stands_beside_the_plan_where_the_exact_planner_was_asked(clocked):

@@ -112,16 +112,23 @@ class MacroMappo:
 
     def _traced(self, i: int) -> jax.stages.Lowered:
         """The update on a family, which is the config's number i, before XLA compiles it."""
-        config, family, walk = self.config, self.config.families[i], self.walks[i]
-        key, rate = self._key(0, i), np.float32(config.lr)
+        config, (function, fixed) = self.config, self._update(i)
+        given = self._given(i, self._key(0, i), np.float32(config.lr), np.float32(config.ent_coef))
         with jax.default_matmul_precision(PRECISION[config.precision]):
-            if walk is None:
-                return improve.lower(
-                    self.mesh, config.spec, family.draw, config.hyper, config.grown(family),
-                    self.grounds[i], self.learner, key, rate)
-            return update.lower(
-                self.mesh, config.spec, family.draw, config.hyper, self.grounds[i], self.learner,
-                walk, key, rate, np.float32(config.ent_coef))
+            return function.lower(*fixed, *given)
+
+    def _update(self, i: int) -> tuple[Any, tuple[Any, ...]]:
+        """The update on the config's family number i, and its arguments that are static."""
+        config, family = self.config, self.config.families[i]
+        fixed = self.mesh, config.spec, family.draw, config.hyper
+        return (update, fixed) if self.walks[i] is not None else (
+            improve, (*fixed, config.grown(family)))
+
+    def _given(self, i: int, key: Array, lr: np.float32, entropy: np.float32) -> tuple[Any, ...]:
+        """Its other arguments."""
+        walk = self.walks[i]
+        own = (key, lr) if walk is None else (walk, key, lr, entropy)
+        return self.grounds[i], self.learner, *own
 
     def _key(self, number: int, i: int) -> Array:
         """Of round `number` on the config's family number i."""
@@ -146,16 +153,12 @@ class MacroMappo:
     def practise(self, i: int, family: Practice, key: Array, lr: np.float32,
                  entropy: np.float32) -> Report | Grown:
         """One update on a family, which is the config's number i."""
-        config, walk = self.config, self.walks[i]
-        made = self._programs.get(i)  # before `enter`, as on the bench, there is none
-        if walk is None:
-            run = made or partial(improve, self.mesh, config.spec, family.draw, config.hyper,
-                                  config.grown(family))
-            self.learner, grown = run(self.grounds[i], self.learner, key, lr)
-            return grown
-        run = made or partial(update, self.mesh, config.spec, family.draw, config.hyper)
-        self.learner, self.walks[i], report = run(self.grounds[i], self.learner, walk, key, lr,
-                                                  entropy)
+        function, fixed = self._update(i)
+        # Before `enter`, as on the bench, nothing is compiled.
+        run = self._programs.get(i) or partial(function, *fixed)
+        self.learner, *walk, report = run(*self._given(i, key, lr, entropy))
+        if walk:
+            self.walks[i] = walk[0]
         return report
 
     @cached_property
