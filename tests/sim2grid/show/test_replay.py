@@ -169,7 +169,9 @@ PROBE = READY + """
   found.lost = told();
   replay.seek(0);
   replay.play(20);
-  await new Promise(go => setTimeout(go, 500));
+  const begun = Date.now();
+  while (replay.time() <= 1 && Date.now() < begun + 20000)
+    await new Promise(go => requestAnimationFrame(go));
   found.played = replay.time();
   replay.pause();
   slide(15);
