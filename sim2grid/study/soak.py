@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import jax
 import msgspec
 import numpy as np
 
@@ -49,6 +50,10 @@ if TYPE_CHECKING:
 
 BLOCK = 10
 """F: missions in a row on the same ground with the same kinds of robots."""
+FORGET = 20
+"""Blocks after which what JAX traced of ever new teams and grounds is dropped: it would keep the
+last thousands of each kind, half a MiB a mission, and of no use to a team that does not come back.
+"""
 
 SIDES = {8: 0.6, 12: 0.2, 16: 0.1, 24: 0.05, 32: 0.03, 48: 0.01, 64: 0.01}
 """Sides of maps, m, each with its chance: small ones are driven in a second, large ones in ten."""
@@ -240,6 +245,8 @@ def recipe_targets(seed: int, number: int) -> int:
 @functools.lru_cache(maxsize=1)
 def _stage(seed: int, index: int) -> Stage:
     """The missions of a block. Raises InputError where its ground allows none."""
+    if index % FORGET == 0:
+        jax.clear_caches()
     recipe = block(seed, index)
     site, passable = ground_of(recipe)
     drawn = [_draw(recipe, number, site, passable)
