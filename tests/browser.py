@@ -1,6 +1,6 @@
 """A page seen by Chromium without a screen: what it says of itself, what it complains of, how it
 looks. Chromium's own switches do (no driver to keep): a script is put into a copy of the page, and
-the page has not loaded, so Chromium takes no picture of it, before the script has told its findings.
+until it has told its findings the page has not loaded, and Chromium takes no picture of it.
 """
 
 import json
@@ -20,7 +20,7 @@ SWITCHES = (
     "--headless", "--no-sandbox", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--use-gl=angle",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1")  # no network, whatever a page asks for
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1")  # no network but what listens
 
 LISTENS = """<script>
 const complaints = [];
