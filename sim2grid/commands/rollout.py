@@ -407,8 +407,9 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
     begun = time.perf_counter()
     looks: list[float] = []
     with contextlib.ExitStack() as open_until:
-        update = open_until.enter_context(bar("mission", len(execution.record.targets),
-                                              plain_s=PLAIN_S))
+        coming = sum(event.target is not None for event in prepared.mission.events)
+        update = open_until.enter_context(bar(
+            "mission", len(execution.record.targets) + coming, plain_s=PLAIN_S))
         show = None
         if args.viewer:
             from sim2grid.show.viewer import LiveView
@@ -573,7 +574,7 @@ def _show(report: Report, timing: dict[str, float], out: Path, video: Path | Non
     if report.optimum is not None:
         from sim2grid.measure import optimum
 
-        print(f"  {optimum.words(report.optimum)}")
+        print(f"  at the start: {optimum.words(report.optimum)}")
     for target in report.targets:
         by = ", ".join(f"{name} at {distance:.2f} m" for name, distance
                        in zip(target.robots, target.distance_m, strict=True))

@@ -52,6 +52,11 @@ class Shot:
         """The mission second of a frame."""
         return self.start_s + (self.end_s - self.start_s) * frame / max(self.frames, 1)
 
+    @property
+    def happens_s(self) -> float:
+        """The mission second of what a cutaway is about."""
+        return self.end_s - AFTER_S
+
     def speed(self, fps: float) -> float:
         """Mission seconds a film second."""
         return (self.end_s - self.start_s) * fps / max(self.frames, 1)

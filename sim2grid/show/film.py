@@ -192,6 +192,9 @@ class Film:
                  (f"{solved} of {_many(len(record.targets), 'target')} in {record.seconds():.1f} s"
                   f", {_many(len(record.decisions), 'decision')}", 28.0, INK)]
         lines += [(line, 22.0, DIM) for line in self.take.optimum]
+        if self.take.optimum and (record.losses or len(record.targets) > len(
+                self.mission.targets)):
+            lines.append(("both for what was known at the start", 18.0, DIM))
         return [*lines, (self.take.title, 20.0, DIM)]
 
     def _over(self, image: Image.Image, shot: Shot, moment: Moment, seen: Seen) -> None:
@@ -273,6 +276,8 @@ class Film:
             caption = shot.words if done else (
                 f"{name} needs {requirement(self.record.targets[shot.target])}")
             color = SOLVED if done else OPEN
+        elif shot.kind == "close" and moment.time_s < shot.happens_s - 1e-6:
+            caption = "" if shot.robot is None else self.mission.robots[shot.robot].name
         if not caption:
             return []
         top = self.height - (CHIP[1] + MARGIN + 52) * u

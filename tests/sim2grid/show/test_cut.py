@@ -47,8 +47,8 @@ def test_the_last_target_and_a_lost_robot_come_first():
     shown = [(s.robot, s.target) for s in cut(lost, 14.0, 30.0) if s.kind == "close"]
     assert (None, 3) in shown
     assert shown == [(1, None), (None, 3)] or shown == [(None, 3)]
-    longer = [s.robot for s in cut(lost, 24.0, 30.0) if s.kind == "close"]
-    assert 1 in longer
+    longer = {s.robot: s for s in cut(lost, 24.0, 30.0) if s.kind == "close"}
+    assert longer[1].happens_s == pytest.approx(40.0)
 
 
 def test_a_short_mission_is_shown_at_true_speed_and_no_longer_than_it_is():

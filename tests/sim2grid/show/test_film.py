@@ -108,6 +108,10 @@ def test_the_cards_say_the_planner_and_the_optimum(short_take):
     assert end[0] == "Mission complete"
     assert end[1].startswith("2 of 2 targets in ")
     assert "proved optimum: 2 decisions" in end
+    late = msgspec.structs.replace(film.mission, targets=film.mission.targets[:1])
+    for mission, said in (film.mission, False), (late, True):
+        lines = Film(replace(film.take, mission=mission)).end_lines()
+        assert ("both for what was known at the start" in [line for line, _, _ in lines]) is said
 
 
 def test_planned_ways_leave_out_who_stays():
