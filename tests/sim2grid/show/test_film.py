@@ -3,6 +3,7 @@
 import subprocess
 
 import imageio_ffmpeg
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
