@@ -22,7 +22,8 @@ from training.run import checkpoints, metrics
 GOLDEN = Path("tests/golden/certified_optima.jsonl").resolve()
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None,
                                reason="needs pip install 'moonteam[ray]'")
-ALONE = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "1"}
+ALONE = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "1",
+                      "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 4}
 PIECES = """
 import os, signal, sys
 from pathlib import Path
@@ -77,7 +78,8 @@ TRAINING = ("import dataclasses; from training.mappo.macro import config; "
 
 def moonteam(*words, before="", **more):
     """Starts a command in a process of its own."""
-    return subprocess.Popen([sys.executable, "-c", before + MAIN, *map(str, words)], env=ALONE,
+    more.setdefault("env", ALONE)
+    return subprocess.Popen([sys.executable, "-c", before + MAIN, *map(str, words)],
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
 
 
@@ -250,6 +252,15 @@ def test_missions_are_the_same_on_a_cluster_that_stands_by_itself(tmp_path, head
         out = tmp_path / str(number)
         assert finished(moonteam(*words, "--out", out, "--on", address))[0] == here
         assert sorted((out / "rows.jsonl").read_text().splitlines()) == sorted(rows)
+
+
+@needs_ray
+@pytest.mark.soak
+def test_who_lacks_the_token_is_told(tmp_path, head):
+    for address in head:
+        child = moonteam("evaluate", "grid", GOLDEN, "--limit", "1", "--on", address,
+                         env=ALONE | {"RAY_AUTH_TOKEN": "f" * 64})
+        assert f"--on: {address} wants its token: set RAY_AUTH_MODE=token" in finished(child, 2)[1]
 
 
 @needs_ray

@@ -257,7 +257,16 @@ def _connect(ray: Any, on: str, address: tuple[str, int] | None) -> None:
     try:
         ray.init("local" if address is None else on, **quiet)
     except (ConnectionError, ImportError, OSError, RuntimeError, ValueError) as error:
-        raise InputError("--on", f"{on}: {_first_line(error)}") from None
+        raise InputError("--on", _no_token(on) if _TOKEN.search(str(error)) else
+                         f"{on}: {_first_line(error)}") from None
+
+
+_TOKEN = re.compile("unauthenticated|auth.?token", re.IGNORECASE)
+
+
+def _no_token(on: str) -> str:
+    return (f"{on} wants its token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to what `ray "
+            "get-auth-token` says where it was started, or have that in ~/.ray/auth_token")
 
 
 def _check_answer(on: str, address: tuple[str, int]) -> None:
@@ -272,10 +281,12 @@ def _check_answer(on: str, address: tuple[str, int]) -> None:
     if on.startswith("ray://"):
         return
     try:
-        subprocess.run([sys.executable, "-c", _JOIN, on], capture_output=True, timeout=_HEALTHY,
-                       check=False)
+        tried = subprocess.run([sys.executable, "-c", _JOIN, on], capture_output=True, text=True,
+                               timeout=_HEALTHY, check=False)
     except subprocess.TimeoutExpired:
         raise InputError("--on", f"what answers at {on} is no Ray cluster; {start}") from None
+    if tried.returncode and _TOKEN.search(tried.stderr):
+        raise InputError("--on", _no_token(on))
 
 
 def _first_line(error: BaseException) -> str:
