@@ -13,6 +13,7 @@ import pytest
 import moonteam
 from moonteam import api, cli, files, results
 from moonteam.planners import registry as planners
+from moonteam.planners.exact import ExactPlanner
 from moonteam.policies.policy import Policy
 from moonteam.results import Rollout, Training
 from moonteam.robots import KINDS
@@ -94,6 +95,87 @@ def test_plan_follows_the_clock(capsys):
             one["target"] for one in printed["schedule"]]
 
 
+def test_missions_are_evaluated_as_the_command_does(capsys):
+    words = ["evaluate", "execution", "--mission", "demo", "--planner", "exact", "greedy",
+             "--loop", "grid", "--json"]
+    assert cli.main(words) == 0
+    printed = msgspec.json.decode(capsys.readouterr().out)
+    report = moonteam.evaluate("demo", ["exact", "greedy"], loop="grid")
+    assert msgspec.json.decode(files.dump_json(report)) == printed
+    assert capsys.readouterr().out == ""
+    assert [row["contender"] for row in report.rows] == ["grid exact", "grid greedy"]
+    for row in (*report.rows, *report.summary):
+        assert all(isinstance(v, (str, int, float, bool, type(None))) for v in row.values())
+    best = report.rows[0]
+    assert (best["mission"], best["success"], best["cause"]) == ("demo", True, None)
+    assert best["decisions"] == moonteam.plan("demo").makespan == report.summary[0]["decisions"]
+    page = report._repr_html_()
+    assert "<td>grid exact</td>" in page
+    assert "<th>over_plan</th>" not in page, "nothing is known of it in steps"
+    table = pytest.importorskip("pandas").DataFrame(report.rows)
+    assert report.to_pandas().equals(table)
+    assert table.groupby("contender").success.mean()["grid greedy"] == 1.0
+
+
+def test_missions_made_in_python_are_evaluated_and_go_on(tmp_path):
+    demo = moonteam.load("demo")
+    renamed = tuple(msgspec.structs.replace(r, name=f"{r.name}2") for r in demo.robots)
+    several = [demo, msgspec.structs.replace(demo, robots=renamed, targets=demo.targets[:1])]
+    report = moonteam.evaluate(several, "exact", loop="grid", out=tmp_path / "run")
+    assert [len(one["mission"]["targets"]) for one in report["missions"]] == [3, 1]
+    assert [(row["mission"], row["targets"]) for row in report.rows] == [("demo", 3), ("demo", 1)]
+    assert report.rows[1]["seconds"] < report.rows[0]["seconds"]
+    assert {file.name for file in (tmp_path / "run").iterdir()} == {
+        "config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md"}
+    header, *lines = (tmp_path / "run" / "rows.csv").read_text().splitlines()
+    assert {"hopper_moves", "hopper2_moves"} <= set(header.split(","))
+    assert len(lines) == 2
+    assert ",1," in lines[0], "yes is 1"
+    again = moonteam.evaluate(several, "exact", loop="grid", out=tmp_path / "run", resume=True)
+    assert again["rows"] == report["rows"]
+    with pytest.raises(moonteam.InputError, match="other options: made"):
+        moonteam.evaluate(several[::-1], "exact", loop="grid", out=tmp_path / "run", resume=True)
+    with pytest.raises(moonteam.InputError, match="--force replaces"):
+        moonteam.evaluate(demo, "exact", loop="grid", out=tmp_path / "run")
+    with pytest.raises(moonteam.InputError, match="no robot has skill Z"):
+        moonteam.evaluate(msgspec.structs.replace(demo, targets=(
+            msgspec.structs.replace(demo.targets[1], skills=("Z",)),)), loop="grid")
+
+
+def test_missions_are_drawn_where_none_is_given():
+    report = moonteam.evaluate(site="flat", count=2, targets=2, side=6, planner="exact",
+                               loop="grid")
+    assert [row["mission"] for row in report.rows] == ["flat-0-0", "flat-0-1"]
+    assert report["meta"]["command"] == (
+        "moonteam evaluate execution --targets 2 --side 6 --site flat --count 2 --loop grid "
+        "--planner exact")
+    assert report.summary[0]["intervals.success.1"] == 1.0
+
+
+@pytest.mark.parametrize(("what", "options"), [("demo", {"loop": "grid"}), ("3x5", {"limit": 2})])
+def test_an_evaluation_that_is_stopped_saves_what_was_done(what, options, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ExactPlanner, "plan", stop)
+    with pytest.raises(KeyboardInterrupt):
+        moonteam.evaluate(what, ["greedy", "exact"], out=tmp_path, **options)
+    report = files.read_json(tmp_path / "report.json")
+    assert report["interrupted"]
+    assert len(report["rows"]) == options.get("limit", 1), "what greedy made"
+
+
+def test_plans_are_saved_where_a_folder_is_given(tmp_path):
+    few = moonteam.load("3x5")[:2]
+    report = moonteam.evaluate(few, "greedy", out=tmp_path / "run")
+    assert files.read_json(tmp_path / "run" / "report.json")["rows"] == report["rows"]
+    assert (tmp_path / "run" / "gaps.png").exists()
+    again = moonteam.evaluate(few, "greedy", out=tmp_path / "run", resume=True)
+    assert again["rows"] == report["rows"], "their seconds too: they were not made again"
+    with pytest.raises(moonteam.InputError, match="other options: made"):
+        moonteam.evaluate(few[:1], "greedy", out=tmp_path / "run", resume=True)
+
+
 @pytest.mark.parametrize(("call", "says"), [
     (lambda: moonteam.plan("3x5"), "choose one"),
     (lambda: moonteam.plan("outpost", time_limt=3), "did you mean time_limit"),
@@ -101,6 +183,14 @@ def test_plan_follows_the_clock(capsys):
     (lambda: moonteam.plan("outpost", "policy", policy="any_taem"), "any_team"),
     (lambda: moonteam.rollout("outpost", backnd="native"), "did you mean backend"),
     (lambda: moonteam.evaluate("3x5", decod="argmax"), "did you mean decode"),
+    (lambda: moonteam.evaluate("outpst"), "did you mean outpost"),
+    (lambda: moonteam.evaluate("outpost", limit=3), "no such option"),
+    (lambda: moonteam.evaluate(["demo", "demo"]), "give each once"),
+    (lambda: moonteam.evaluate(["demo", moonteam.load("3x5:0")]), "one or the other"),
+    (lambda: moonteam.evaluate("demo", side=8), "is for random missions"),
+    (lambda: moonteam.evaluate(site=["flat", "mares"]), "'mares' is not one of .*mare\\?"),
+    (lambda: moonteam.evaluate("sampling"), "by the clock"),
+    (lambda: moonteam.rollout("demo", mode="asynch"), "did you mean async"),
     (lambda: moonteam.train("smal"), "small"),
     (lambda: moonteam.train("small", sed=1), "no such option; did you mean --seed"),
     (lambda: moonteam.make("MoonGrid"), "did you mean MoonGrid-v0"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,7 +19,8 @@ from moonteam.report.journal import Journal
 from moonteam.report.progress import say
 
 if TYPE_CHECKING:
-    from sim2grid.study.evaluation import Evaluation, Row
+    from moonteam.problem.mission import Mission
+    from sim2grid.study.evaluation import Evaluation
     from sim2grid.study.fleet import Given, Recipe
 
 DRAWN = ("team", "site", "count", "cell", "lose", "slow", "silent", "new_targets", "impassable",
@@ -100,43 +102,59 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
 
 def run(args: Args) -> int:
     """Evaluates, prints, saves."""
+    begun = time.perf_counter()
+    report, rows = carry_out(args)
+    _print(args, report)
+    say(f"moonteam: {len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
+    return journal.interrupted(args.out) if "interrupted" in report else 0
+
+
+def carry_out(args: Args, made: Sequence[Mission] = ()
+              ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The report, and its rows as rows.csv has them; in --out too, where that is given.
+
+    `made` are the missions of --mission where they are no files. Raises InputError before anything
+    is written. An interrupted report has the key `interrupted`.
+    """
     _check(args)
     with cluster(args.on, at_once=True) as workers:
-        return _run(args, workers)
+        return _carry_out(args, made, workers)
 
 
-def _run(args: Args, workers: Cluster | None) -> int:
+def _carry_out(args: Args, made: Sequence[Mission], workers: Cluster | None
+               ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     from moonteam.compilation import call_at_once, enable_cache
 
     enable_cache()
     call_at_once()
     from moonteam.report import provenance
     from sim2grid.study.evaluation import Row
-    from sim2grid.study.summary import document
+    from sim2grid.study.summary import document, flat_rows
 
-    evaluation = _evaluation(args)
+    given = _given(args, made) if args.mission else []
+    evaluation, options = _evaluation(args, given), _options(args)
     evaluation.cluster = workers
     evaluation.prepare()  # refuses what cannot be run before anything is written
     if args.out:
-        held = Journal[Row](args.out, args.resume, _options(args), Row, FILES)
+        asked = options | ({"made": [one.text for one in given]} if made else {})
+        held = Journal[Row](args.out, args.resume, asked, Row, FILES)
         evaluation.rows |= {(row.contender, row.number): row for row in held.entries}
         evaluation.keep = held.add
-    begun, interrupted = time.perf_counter(), False
+    interrupted = False
     try:
         evaluation.run()
     except KeyboardInterrupt:
         interrupted = True
     rows = evaluation.sorted_rows()
-    report = document(rows, evaluation.entries, evaluation.contenders, _options(args),
-                      provenance.meta(command.line("evaluate execution", args), args.seed),
-                      args.seed)
+    line = "moonteam.evaluate" if made else command.line("evaluate execution", args)
+    report = document(rows, evaluation.entries, evaluation.contenders, options,
+                      provenance.meta(line, args.seed), args.seed)
     if interrupted:
         report["interrupted"] = True
+    flat = flat_rows(rows)
     if args.out:
-        _save(args.out, report, rows)
-    _print(args, report)
-    say(f"moonteam: {len(rows)} missions in the report; {time.perf_counter() - begun:.0f} s")
-    return journal.interrupted(args.out) if interrupted else 0
+        _save(args.out, report, flat)
+    return report, flat
 
 
 def _check(args: Args) -> None:
@@ -148,10 +166,10 @@ def _check(args: Args) -> None:
         ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
 
 
-def _evaluation(args: Args) -> Evaluation:
+def _evaluation(args: Args, given: list[Given]) -> Evaluation:
     from sim2grid.study.evaluation import Evaluation, contenders, deciders
 
-    recipes = _given(args) if args.mission else _recipes(args)
+    recipes = given or _recipes(args)
     # The plans of these loops are made in steps, whatever the modes of the others.
     modes = args.mode if not {"open", "grid"} & {*args.loop} else (*args.mode, "barrier")
     who = [deciders(name, args.planner_options(), modes) for name in args.planner]
@@ -187,9 +205,8 @@ def _recipes(args: Args) -> list[Recipe]:
                    ground) for name, ground in grounds]
 
 
-def _given(args: Args) -> list[Given]:
+def _given(args: Args, made: Sequence[Mission]) -> list[Given]:
     """The missions that were given. Raises InputError for what cannot go with them."""
-    from moonteam.loading import load_mission
     from sim2grid.clock.prepare import by_the_clock
     from sim2grid.study.fleet import Given
 
@@ -198,16 +215,17 @@ def _given(args: Args) -> list[Given]:
         if getattr(args, name) != getattr(usual, name):
             raise InputError(command.flag(name), "is for random missions; those of --mission say "
                              "it themselves")
-    if len(set(args.mission)) < len(args.mission):
+    given = [Given.of(mission) for mission in made] or [Given(name) for name in args.mission]
+    if len(set(given)) < len(given):
         raise InputError("--mission", "give each once")
-    for name in args.mission:
-        mission = load_mission(name)
+    for one in given:
+        mission = one.mission()
         if "clock" in args.mode:
-            by_the_clock(mission, name)
+            by_the_clock(mission, one.name)
         if mission.clock == "seconds" and ({*args.mode} != {"clock"} or {*args.loop} != {"closed"}):
-            raise InputError(name, "is by the clock, which --mode clock --loop closed alone "
+            raise InputError(one.name, "is by the clock, which --mode clock --loop closed alone "
                              "executes", "clock")
-    return [Given(name) for name in args.mission]
+    return given
 
 
 def _options(args: Args) -> dict[str, Any]:
@@ -222,16 +240,16 @@ def _options(args: Args) -> dict[str, Any]:
     return options | {"rates": rates}
 
 
-def _save(out: Path, report: dict[str, Any], rows: list[Row]) -> None:
+def _save(out: Path, report: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     from moonteam.report.tables import plain_csv, plain_markdown
     from sim2grid.study.evaluation_page import evaluation_page
-    from sim2grid.study.summary import csv_rows, tables
+    from sim2grid.study.summary import tables
 
     files.write_json(out / "report.json", report)
     files.write_text(out / "report.html", evaluation_page(report, str(out / "report.json")))
     files.write_text(out / "table.md", plain_markdown(report, tables(report)) + "\n")
     if rows:
-        files.write_text(out / "rows.csv", plain_csv(csv_rows(rows)))
+        files.write_text(out / "rows.csv", plain_csv(rows))
 
 
 def _print(args: Args, report: dict[str, Any]) -> None:

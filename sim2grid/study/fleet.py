@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from moonteam.errors import InputError
 from moonteam.grid import scenarios
-from moonteam.loading import load_mission
+from moonteam.loading import decode_mission, load_mission
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.planners import registry, simulate
 from moonteam.planners.base import IntArray, Plan, Snapshot, WholePlanner
@@ -104,13 +104,25 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Given:
-    """A mission of a user's, by its file or the name of a bundled one, in place of drawn ones."""
+    """A mission of a user's in place of drawn ones: its file, the name of a bundled one, or one
+    that was made in Python, of which `text` is the JSON.
+    """
 
     name: str
+    text: str = ""
+
+    @classmethod
+    def of(cls, mission: Mission) -> Given:
+        """One that was made in Python."""
+        return cls(mission.name or "mission", msgspec.json.encode(mission).decode())
+
+    def mission(self) -> Mission:
+        """The mission, checked. Raises InputError."""
+        return decode_mission(self.text, self.name) if self.text else load_mission(self.name)
 
     def eventful(self) -> bool:
         """Whether something happens in it."""
-        return bool(load_mission(self.name).events)
+        return bool(self.mission().events)
 
 
 GIVEN = "missions"
@@ -192,7 +204,7 @@ def make_fleet(recipe: Recipe | Given, count: int,
     Raises InputError for numbers out of range, or ground that allows no mission.
     """
     if isinstance(recipe, Given):
-        return fleet_of_one(load_mission(recipe.name), recipe.name)
+        return fleet_of_one(recipe.mission(), recipe.name)
     site, passable = ground_of(recipe, change)
     drawn = [draw_mission(recipe, number, site, passable) for number in range(count)]
     chosen, kinds = [mission for mission, _ in drawn], crew(recipe)

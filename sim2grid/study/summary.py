@@ -337,8 +337,8 @@ def _mode(line: dict[str, Any]) -> str:
     return " ".join(words) or "-"
 
 
-def csv_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """One flat row a mission and contender."""
+def flat_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """One flat row a mission and contender, for rows.csv and for pandas."""
     found = []
     for row in rows:
         report = row.report
@@ -346,9 +346,9 @@ def csv_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
         flat: dict[str, Any] = {
             "number": row.number, "mission": row.report.mission, "site": row.site,
             "site_seed": row.site_seed, "seed": row.seed,
-            "contender": row.contender, "success": int(report.success),
-            "solvable": int(row.solvable), "cause": report.cause or "",
-            "failure": "" if report.success else failure_label(row), "detail": report.detail,
+            "contender": row.contender, "success": report.success,
+            "solvable": row.solvable, "cause": report.cause,
+            "failure": None if report.success else failure_label(row), "detail": report.detail,
             "seconds": report.seconds, "nominal_s": row.nominal_s,
             "decisions": report.decisions, "plan_decisions": plan.makespan if plan else None,
             "moves": report.moves, "plan_moves": plan.moves if plan else None,

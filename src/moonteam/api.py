@@ -6,6 +6,7 @@ same name does, with the same options under the same names.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 import os
@@ -13,18 +14,28 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 
 from moonteam import files, interrupts, loading, outputs
-from moonteam.errors import InputError, meant
+from moonteam.errors import InputError, meant, not_one_of
 from moonteam.loading import load
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
 from moonteam.registry import Registry
-from moonteam.results import Evaluation, Rollout, Training
+from moonteam.results import Evaluation, Rollout, Row, Training
 
 if TYPE_CHECKING:  # JAX and MuJoCo, which take seconds, are loaded when they are needed
     from moonteam.planners.base import Plan, Planner
@@ -98,11 +109,10 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
     saved then).
     """
     command = _command("sim2grid", "rollout")
-    folder = None if out is None else Path(out)
-    args = _built(command.Args, "rollout",
-                  {"planner": planner, "out": folder, "video": video, **options})
+    args = _read(command.Args, "rollout",
+                 {"planner": planner, "out": out, "video": video, **options})
     if isinstance(mission, Mission):
-        folder = command.folder(mission.name, folder, args.force)
+        folder = command.folder(mission.name, args.out, args.force)
         with outputs.folder(folder, (*command.FILES, WRITTEN), force=args.force):
             done = command.carry_out(replace(args, out=folder,
                                              mission=os.fspath(_write(folder, mission))))
@@ -123,43 +133,87 @@ def _write(folder: Path, mission: Mission) -> Path:
     return folder / WRITTEN
 
 
-def evaluate(what: Named | Scenario | Timed | Sequence[Scenario] | Sequence[Timed],
-             planner: str | Sequence[str] = "exact", *, limit: int | None = None,
-             **options: Any) -> Evaluation:
-    """Planners side by side on scenarios, as `moonteam evaluate grid`.
+def evaluate(what: Named | Scenario | Timed | Mission | Sequence[Scenario] | Sequence[Timed]
+             | Sequence[Named | Mission] | None = None,
+             planner: str | Sequence[str] | None = None, **options: Any) -> Evaluation:
+    """Planners side by side: plans of scenarios, as `moonteam evaluate grid`, or missions in
+    physics, as `moonteam evaluate execution`.
 
     Args:
-      what: a set, or scenarios, in steps or by the clock.
-      planner: one planner, or several.
-      limit: only the first so many scenarios.
-      **options: of the command, one value or several: policy="any_team",
-        decode=("argmax", "best-of-16"), time_limit=0.1.
+      what: a set, or scenarios, in steps or by the clock: their plans. A mission, its file or the
+        name of a bundled one, or several of them: they are executed. None: missions are drawn, and
+        executed.
+      planner: one planner, or several. None: the exact planner; in physics the policy.
+      **options: of the command, one value or several. Of plans: limit=20, policy="any_team",
+        decode=("argmax", "best-of-16"), time_limit=0.1. Of executions: mode=("barrier", "async"),
+        loop=("closed", "open"), site="mare", count=5. Nothing is written without out=FOLDER.
 
     Returns the document that the command prints as JSON, a dict. Its `summary` has one flat row a
-    planner, its `rows` one a planner and scenario, which `to_pandas()` makes a table of; a
-    notebook shows it. Raises InputError, and KeyboardInterrupt when stopped.
+    planner, its `rows` one a planner and scenario, or contender and mission, which `to_pandas()`
+    makes a table of; a notebook shows it. Raises InputError, and KeyboardInterrupt when stopped
+    (what was done is saved then in `out`).
     """
-    from moonteam import compilation
+    given = _missions(what)
+    if given is None:
+        return _plans(what, {"planner": planner or "exact", **options})
+    return _executions(given, options if planner is None else {"planner": planner, **options})
+
+
+def _missions(what: Any) -> list[Named | Mission] | None:
+    """The missions to be executed, none where they are drawn; None for scenarios."""
+    if what is None:
+        return []
+    if isinstance(what, (str, os.PathLike)):
+        return [what] if loading.names_mission(os.fspath(what)) else None
+    if isinstance(what, (Mission, Scenario, Timed)):
+        return [what] if isinstance(what, Mission) else None
+    many = [isinstance(one, (str, os.PathLike, Mission)) for one in what]
+    if any(many) and not all(many):
+        raise InputError("evaluate", "missions and scenarios together; give one or the other")
+    return list(what) if any(many) else None
+
+
+def _plans(what: Any, options: dict[str, Any]) -> Evaluation:
+    from moonteam.commands.options import keeping
     from moonteam.report import command as commands
 
     command = _command("moonteam", "evaluate_grid")
     named = os.fspath(what) if isinstance(what, (str, os.PathLike)) else None
-    many = ("objective", "policy", "preference", "decode", "time_limit")
-    args = _built(command.Args, "evaluate", {
-        "set": named, "planner": _several(planner), "limit": limit,
-        **{key: _several(value) if key in many else value for key, value in options.items()}})
-    compilation.enable_cache()
-    if isinstance(what, (str, os.PathLike)):
-        found = command.load_any(os.fspath(what), limit)
-        title, made_by = Path(what).stem, commands.line("evaluate grid", args)
+    args = _read(command.Args, "evaluate", {"set": named, **options})
+    made = ""
+    if named is not None:
+        found = command.load_any(named, args.limit)
+        title, line = Path(named).stem, commands.line("evaluate grid", args)
     else:
-        found = [what] if isinstance(what, (Scenario, Timed)) else list(what)[:limit]
-        title, made_by = "scenarios", "moonteam.evaluate"
-    document, _ = command.judged(found, command.options_of(args), args.seed,
-                                 f"{title}: {len(found)} scenarios", made_by)
+        found = [what] if isinstance(what, (Scenario, Timed)) else list(what)[:args.limit]
+        title, line = "scenarios", "moonteam.evaluate"
+        made = hashlib.sha256(msgspec.json.encode(found)).hexdigest()
+    with keeping(args, command.FILES):
+        document, form = command.judged(args, found, f"{title}: {len(found)} scenarios", line, made)
+        command.save(args, document, form, command.PICTURE)
+    return _evaluation(document)
+
+
+def _executions(given: list[Named | Mission], options: dict[str, Any]) -> Evaluation:
+    from moonteam.commands.options import keeping
+
+    command = _command("sim2grid", "evaluate_execution")
+    made: list[Mission] = []
+    if any(isinstance(one, Mission) for one in given):
+        made = [one if isinstance(one, Mission) else loading.load_mission(os.fspath(one))
+                for one in given]
+    names = [one.name or "mission" for one in made] or [
+        os.fspath(one) for one in given if not isinstance(one, Mission)]
+    args = _read(command.Args, "evaluate", {"mission": names, **options})
+    with keeping(args, command.FILES):
+        document, rows = command.carry_out(args, made)
+    return _evaluation(document, rows)
+
+
+def _evaluation(document: dict[str, Any], rows: Sequence[Row] | None = None) -> Evaluation:
     if "interrupted" in document:
         raise KeyboardInterrupt
-    return Evaluation(document)
+    return Evaluation(document, rows)
 
 
 def train(preset: str, *words: str, out: Named | None = None, **options: Any) -> Training:
@@ -272,6 +326,29 @@ def _built(kind: type[T], call: str, options: dict[str, Any]) -> T:
         if key not in known:
             raise _unknown(f"{call}({key}=)", key, known)
     return kind(**options)
+
+
+def _read(kind: type[T], call: str, options: dict[str, Any]) -> T:
+    """The arguments of a command, as its command line would give them: several values where the
+    option takes several, words of those that are allowed. Raises InputError.
+    """
+    hints = get_type_hints(kind)
+    return _built(kind, call, {
+        key: _taken(hints[key], value, f"{call}({key}=)") if key in hints else value
+        for key, value in options.items()})
+
+
+def _taken(hint: Any, value: Any, source: str) -> Any:
+    """A value as an option of this type has it. Raises InputError."""
+    for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
+        its = get_args(kind)
+        if value is None or kind is Path:
+            return value if value is None else Path(value)
+        if get_origin(kind) is tuple:
+            return tuple(_taken(its[0], one, source) for one in _several(value))
+        if get_origin(kind) is Literal and value not in its:
+            raise InputError(source, not_one_of(value, its))
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def _unknown(source: str, key: str, known: Sequence[str]) -> InputError:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from moonteam import paths
+from moonteam import files, paths
 from moonteam.errors import InputError, meant
 from moonteam.problem import mission as missions
 from moonteam.problem import scenario, timed
@@ -35,16 +35,27 @@ def load(source: str | os.PathLike[str]
         return pick(paths.find(head, *SETS), which)
     if path.suffix == ".jsonl":
         return load_set(path)
-    if path.suffix in YAML or (not path.suffix and not path.is_file()):
-        sets, known = (paths.bundled_names(*kind) for kind in (SETS, MISSIONS))
-        if name in sets and not path.suffix:
-            return load_set(paths.find(name, *SETS))
-        if not path.is_file() and not path.suffix and name not in known:
-            what = "is a folder" if path.is_dir() else "no such file"
-            raise InputError(name, f"{what}; {meant(name, [*known, *sets])}bundled "
-                             f"missions: {', '.join(known)}; sets: {', '.join(sets)}")
+    if names_mission(name):
         return load_mission(name)
+    if not path.suffix and not path.is_file():
+        return load_set(paths.find(name, *SETS))
     return timed.load(path) if timed.by_the_clock(path) else scenario.load(path)
+
+
+def names_mission(name: str) -> bool:
+    """Whether it is the file or the name of a mission, and not of scenarios.
+
+    Raises InputError for a name, not that of a file, which is neither's.
+    """
+    path = Path(name)
+    if path.suffix or path.is_file():
+        return path.suffix in YAML
+    sets, known = (paths.bundled_names(*kind) for kind in (SETS, MISSIONS))
+    if name not in (*sets, *known):
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise InputError(name, f"{what}; {meant(name, [*known, *sets])}bundled "
+                         f"missions: {', '.join(known)}; sets: {', '.join(sets)}")
+    return name not in sets
 
 
 def load_set(path: Path) -> list[Scenario] | list[Timed]:
@@ -84,13 +95,22 @@ def load_mission(name: str) -> Mission:
 
     Files that it names have their full paths: it can be written anywhere. Raises InputError.
     """
+    return _settled(*read_mission(name))
+
+
+def decode_mission(text: str, source: object) -> Mission:
+    """The same of a mission that was made in Python, from its JSON. Raises InputError."""
+    found = files.convert(msgspec.json.decode(text), Mission, source)
+    return _settled(missions.check(found, source), source)
+
+
+def _settled(found: Mission, source: object) -> Mission:
     from moonteam.robots import team
 
-    found, path = read_mission(name)
     if found.site.dem is not None:
         full = os.fspath(Path(found.site.dem).resolve())
         found = msgspec.structs.replace(found, site=msgspec.structs.replace(found.site, dem=full))
-    return team.settled(found, path)
+    return team.settled(found, source)
 
 
 def read_mission(name: str) -> tuple[Mission, Path]:

@@ -51,16 +51,28 @@ def frame(rows: Sequence[Row]) -> Any:
 
 
 class Evaluation(dict):
-    """Planners side by side: the document of `moonteam evaluate grid --json`, a dict."""
+    """Planners side by side: the document of `moonteam evaluate grid --json`, or of `evaluate
+    execution --json`, a dict.
+
+    Args:
+      document: the document.
+      rows: its rows where they are flat otherwise than under names with dots.
+    """
+
+    def __init__(self, document: dict[str, Any], rows: Sequence[Row] | None = None):
+        super().__init__(document)
+        self._rows = rows
 
     @property
     def rows(self) -> list[Row]:
-        """One a planner and scenario."""
-        return [flat(row) for row in self["rows"]]
+        """One a planner and scenario; of executions one a contender and mission, as rows.csv."""
+        return [flat(row) for row in self["rows"]] if self._rows is None else list(self._rows)
 
     @property
     def summary(self) -> list[Row]:
-        """One a planner; intervals.KEY.0 and .1 are the ends of the 95 % interval of KEY."""
+        """One a planner, of executions one a site and contender; intervals.KEY.0 and .1 are the
+        ends of the 95 % interval of KEY.
+        """
         return [flat(row) for row in self["summary"]]
 
     def to_pandas(self) -> Any:
@@ -68,7 +80,8 @@ class Evaluation(dict):
         return frame(self.rows)
 
     def _repr_html_(self) -> str:
-        shown = [{k: v for k, v in row.items() if "." not in k} for row in self.summary]
+        shown = [{k: v for k, v in row.items() if "." not in k and v is not None}
+                 for row in self.summary]
         head = list(dict.fromkeys(key for row in shown for key in row))
         notes = "".join(f"<li>{html.escape(note)}</li>" for note in self["notes"])
         return (f"<b>{html.escape(self['title'])}</b>"

@@ -16,11 +16,12 @@ from moonteam.commands.options import Apart, Drawn, Limited, Many, Reported, Res
 from moonteam.errors import InputError
 from moonteam.problem.scenario import Scenario
 from moonteam.problem.timed import Timed
-from moonteam.report.journal import NOTHING, Kept
+from moonteam.report.journal import Kept
 
 FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", "table.md",
          "gaps.png")
 """In --out."""
+PICTURE = "gaps.png"
 
 
 @dataclass(frozen=True)
@@ -127,18 +128,25 @@ def options_of(args: Any) -> Any:
         threads=getattr(args, "threads", 1))
 
 
-def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
-    """Saves and prints a report as the options wish; returns the exit code.
-
-    `form` is the module that made it, with its COLUMNS, PAGE and PANELS; an interrupted report
-    says on standard error what it lacks.
-    """
+def save(args: Any, document: dict, form: Any, picture: str) -> None:
+    """Writes the files of the document into --out, if it is given; see `deliver`."""
     from moonteam.evaluation import figures
     from moonteam.report import tables
 
     if args.out:
         tables.save(args.out, document, form.PAGE)
         figures.bars(args.out / picture, document, form.PANELS)
+
+
+def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
+    """Saves and prints a report as the options wish; returns the exit code.
+
+    `form` is the module that made it, with its COLUMNS, PAGE and PANELS; an interrupted report
+    says on standard error what it lacks.
+    """
+    from moonteam.report import tables
+
+    save(args, document, form, picture)
     tables.print_columns(args, document, form.PAGE, form.COLUMNS)
     if "interrupted" not in document:
         return 0
@@ -150,21 +158,30 @@ def deliver(args: Any, document: dict, form: Any, picture: str) -> int:
 
 def run(args: Args) -> int:
     """Evaluates, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
+    from moonteam.report import command
+
+    document, form = judged(args, *_scenarios(args), command.line("evaluate grid", args))
+    return deliver(args, document, form, PICTURE)
+
+
+def judged(args: Args, found: Sequence[Scenario | Timed], title: str, line: str,
+           made: str = "") -> tuple[dict, Any]:
+    """The report on scenarios in steps or by the clock, and the module that says its form.
+
+    `line` is what makes it again; `made` tells scenarios that are in no file from others.
+    """
     compilation.enable_cache()
     from moonteam.report import command, journal
 
-    found, title = _scenarios(args)
     with cluster(args.on) as workers:
         options = options_of(args)
-        kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
-        document, form = judged(found, options, args.seed, title,
-                                command.line("evaluate grid", args), kept, workers)
-    return deliver(args, document, form, "gaps.png")
+        asked = command.figures(args) | ({"made": made} if made else {})
+        kept = journal.Kept.of(args.out, args.resume, asked, FILES)
+        return _judged(found, options, args.seed, title, line, kept, workers)
 
 
-def judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str,
-           line: str, kept: Kept = NOTHING, workers: Cluster | None = None) -> tuple[dict, Any]:
-    """The report on scenarios in steps or by the clock, and the module that says its form."""
+def _judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str,
+            line: str, kept: Kept, workers: Cluster | None) -> tuple[dict, Any]:
     from moonteam.evaluation import contenders, grid, timed
 
     clocked = [one for one in found if isinstance(one, Timed)]

@@ -8,10 +8,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from moonteam import files
 from moonteam.report.provenance import hardware_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Plain = tuple[list[str], list[list[str]]]
 """A table of plain cells: titles, rows."""
@@ -203,18 +206,46 @@ def _width(lines: Iterable[Sequence[str]]) -> int:
 def show_plain(document: dict, tables: Sequence[Plain]) -> None:
     """The same on the terminal; what is wider is turned."""
     from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
     console = Console()
     for titles, rows in tables:
-        for head, lines in fitted(titles, rows, console.width):
-            table = Table(*map(escape, head))
-            for line in lines:
-                table.add_row(*map(escape, line))
-            console.print(table)
+        show_rows(console, titles, rows)
     for note in (*document["notes"], hardware_line(document["meta"])):
         console.print(note, highlight=False, markup=False)
+
+
+def show_rows(console: Console, titles: Sequence[str],
+              rows: Sequence[Sequence[str | Sequence[str]]], title: str = "",
+              right: Sequence[str] = ()) -> None:
+    """A table on the terminal, never wider than that.
+
+    A cell of several parts has them side by side, or, where the table is too wide so, one a line;
+    what is wider still is turned. `right` are the titles of columns that stand to the right.
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    def joined(sign: str) -> list[list[str]]:
+        return [[cell if isinstance(cell, str) else sign.join(cell) for cell in row]
+                for row in rows]
+
+    lines = joined(" ")
+    whole = _width([titles, *lines]) <= console.width
+    lines = lines if whole else joined("\n")
+    tall = any("\n" in cell for line in lines for cell in line)
+    for number, (head, body) in enumerate(fitted(titles, lines, console.width)):
+        table = Table(title=escape(title) if title and not number else None, show_lines=tall)
+        for word in head:
+            table.add_column(escape(word), overflow="fold", justify=(
+                "right" if head == [*titles] and word in right else "left"))
+        for line in body:
+            table.add_row(*map(escape, line))
+        console.print(table)
+
+
+def parts(names: Iterable[str], word: str) -> list[str]:
+    """Of a cell: names, a word before all but the first."""
+    return [name if not k else f"{word} {name}" for k, name in enumerate(names)]
 
 
 def print_plain(args: Any, document: dict,
@@ -244,9 +275,11 @@ def print_as(args: Any, document: dict, page: Callable[[], str],
 
 
 def plain_csv(rows: Sequence[dict]) -> str:
-    """Flat rows as CSV; the keys of the first are the header."""
+    """Flat rows as CSV, yes and no as 1 and 0; a row without a key of another's is empty there."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(out, list(dict.fromkeys(key for row in rows for key in row)),
+                            lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({key: int(value) if isinstance(value, bool) else value
+                      for key, value in row.items()} for row in rows)
     return out.getvalue()
