@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from moonteam.problem.skills import held
 from sim2grid.measure.story import Replan, Story
 from sim2grid.show.cut import Shot, cut
 from sim2grid.show.hud import Box, Label, Labels, card, chip, plate, put
@@ -31,7 +32,6 @@ from sim2grid.show.picture import (
     draw_replan,
     requirement,
     robot_color,
-    skills_of,
 )
 from sim2grid.show.take import Style, Take, ways
 
@@ -179,7 +179,8 @@ class Film:
         if self.take.about:
             lines.append((self.take.about, 20.0, DIM))
         for i, robot in enumerate(mission.robots[:6]):
-            lines.append((f"{robot.name}: {robot.kind}, {skills_of(robot)}", 24.0, robot_color(i)))
+            lines.append((f"{robot.name}: {robot.kind}, {held(robot.skills)}", 24.0,
+                          robot_color(i)))
         return lines
 
     def end_lines(self) -> list[tuple[str, float, tuple[int, int, int]]]:
@@ -268,7 +269,7 @@ class Film:
         caption, color = shot.words, INK
         if shot.words == "introduction" and shot.robot is not None:
             robot = self.mission.robots[shot.robot]
-            caption = f"{robot.name}: {robot.kind}, {skills_of(robot)}"
+            caption = f"{robot.name}: {robot.kind}, {held(robot.skills)}"
             color = robot_color(shot.robot)
         elif shot.target is not None and shot.words.endswith("solved"):
             done = shot.target in moment.solved
@@ -349,7 +350,7 @@ class Film:
         color = GREY if lost else robot_color(robot)
         state = word if lost else f"{word}  {moment.speeds[robot]:.2f} m/s"
         chip(image, box, self.take.actors[robot].glyph, color,
-             [(f"{spec.name}  {skills_of(spec)}", color),
+             [(f"{spec.name}  {held(spec.skills)}", color),
               (state, STATES.get(word.split(":")[0], INK))], self.unit)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from moonteam import files
+from moonteam.problem.skills import held, needed
 from sim2grid.measure.metrics import Optimum, Report
 from sim2grid.show.picture import robot_color
 from sim2grid.show.plots import hexed
@@ -166,11 +167,6 @@ def name_of_robot(index: int, name: str) -> Raw:
     return Raw(f'<b style="color:{hexed(robot_color(index))}">{html.escape(name)}</b>')
 
 
-def requirement(skills: Sequence[str], kind: str) -> str:
-    """A+B for AND, A/B for OR."""
-    return ("+" if kind == "AND" else "/").join(skills)
-
-
 def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
                  replans: Sequence[tuple[float, int, str]] = (),
                  plots: Sequence[tuple[str, str]] = (), timing: dict[str, float] | None = None,
@@ -234,7 +230,7 @@ def _targets(report: Report) -> str:
     return known(
         ["target", "cell", "needs", "solved", "decision", "time s", "planned s", "by",
          "distance m"],
-        [(t.name, f"{t.at[0]}, {t.at[1]}", requirement(t.skills, t.type), t.solved, t.decision,
+        [(t.name, f"{t.at[0]}, {t.at[1]}", needed(t.skills, t.type == "OR"), t.solved, t.decision,
           t.time_s, t.expected_s, ", ".join(t.robots) or None,
           ", ".join(f"{d:.2f}" for d in t.distance_m) or None) for t in report.targets])
 
@@ -243,7 +239,7 @@ def _robots(report: Report) -> str:
     return known(
         ["robot", "kind", "skills", "moves", "s a move", "way m", "off track rms m", "95 % m",
          "tilt deg", "slip", "late", "wrong cell", "energy kJ", "propellant g", "lost"],
-        [(name_of_robot(i, r.name), r.kind, "".join(r.skills), r.moves, r.seconds_per_move,
+        [(name_of_robot(i, r.name), r.kind, held(r.skills), r.moves, r.seconds_per_move,
           r.distance_m, r.cross_track_rms_m, r.cross_track_p95_m, r.max_tilt_deg, r.slip,
           r.timeouts, r.wrong_cells, r.energy_j / 1000, r.propellant_kg * 1000,
           None if r.lost is None else f"{r.lost.replace('_', ' ')} at {r.lost_s:.1f} s")

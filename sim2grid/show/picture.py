@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from moonteam.problem.mission import Robot, Target
+from moonteam.problem.mission import Target
+from moonteam.problem.skills import needed
 from sim2grid.frame import Frame
 
 if TYPE_CHECKING:
@@ -55,16 +56,9 @@ def robot_color(index: int) -> Color:
     return ROBOTS[index % len(ROBOTS)]
 
 
-def skills_of(robot: Robot) -> str:
-    """Its skills: letters side by side, names apart."""
-    return ("" if all(len(skill) == 1 for skill in robot.skills) else ", ").join(robot.skills)
-
-
 def requirement(target: Target) -> str:
-    """A+B for AND, A/B for OR; names apart."""
-    words = target.words()
-    sign = "/" if target.either else "+"
-    return (sign if all(len(word) == 1 for word in words) else f" {sign} ").join(words)
+    """What a target asks for, see `needed`."""
+    return needed(target.words(), target.either)
 
 
 def hillshade(heights: npt.NDArray, spacing: float) -> npt.NDArray[np.uint8]:

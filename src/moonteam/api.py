@@ -178,13 +178,12 @@ def _plans(what: Any, options: dict[str, Any]) -> Evaluation:
     from moonteam.report import command as commands
 
     command = _command("moonteam", "evaluate_grid")
-    named = os.fspath(what) if isinstance(what, (str, os.PathLike)) else None
-    args = _read(command.Args, "evaluate", {"set": named, **options})
-    made = ""
-    if named is not None:
-        found = command.load_any(named, args.limit)
-        title, line = Path(named).stem, commands.line("evaluate grid", args)
+    if isinstance(what, (str, os.PathLike)):
+        args = _read(command.Args, "evaluate", {"set": what, **options})
+        found = command.load_any(args.set, args.limit)
+        title, line, made = Path(args.set).stem, commands.line("evaluate grid", args), ""
     else:
+        args = _read(command.Args, "evaluate", options)
         found = [what] if isinstance(what, (Scenario, Timed)) else list(what)[:args.limit]
         title, line = "scenarios", "moonteam.evaluate"
         made = hashlib.sha256(msgspec.json.encode(found)).hexdigest()

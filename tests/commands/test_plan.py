@@ -1,6 +1,7 @@
 """`moonteam plan`, from the command line to the files it writes."""
 
 import json
+import re
 
 import pytest
 
@@ -52,6 +53,30 @@ def test_the_table_says_who_goes_where_with_whom_and_when(capsys, scenario_set):
     assert "A AND B" in out
     assert "makespan 9 steps, 12 moves (R1 8, R2 4)" in out
     assert "optimal: proved that no plan has less moves" in out
+
+
+@pytest.mark.parametrize("columns", [80, 40])
+def test_a_table_fits_its_terminal_however_large_the_plan(capsys, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    code, out, _ = run(capsys, "8x40:3", "--planner", "greedy")
+    assert code == 0
+    table, _, _ = out.partition("makespan ")
+    assert max(map(len, table.splitlines())) <= columns
+    assert "…" not in out
+    for target in range(1, 41):
+        assert len(re.findall(rf"\bT{target}\b", out)) == 1
+
+
+def test_names_of_skills_stand_apart(capsys, tmp_path):
+    save_set(tmp_path / "set.jsonl", [Scenario(
+        id="named", size=(8, 6), agents=(Agent((0, 0), ("camera", "radio")),
+                                         Agent((7, 0), ("A", "B"))),
+        targets=(Target((3, 0), ("camera", "B"), "AND"),))])
+    code, out, _ = run(capsys, tmp_path / "set.jsonl")
+    assert code == 0
+    words = " ".join(re.sub(r"[│┃]", " ", out).split())
+    assert "camera AND B" in words
+    assert "R1 (camera, radio) with R2 (AB)" in words
 
 
 def test_weighted_and_its_bound(capsys, scenario_set):

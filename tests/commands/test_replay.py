@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from moonteam import cli
+from moonteam.commands.replay import show
 
 SCENARIO = {
     "id": "two", "size": [5, 5], "max_steps": 10,
@@ -148,6 +149,21 @@ def test_bad_options_give_one_clear_line(words, said, files, capsys):
     code, document, err = replay(capsys, *files, *words)
     assert (code, document) == (2, None)
     assert said in err
+
+
+def test_the_table_fits_its_terminal_however_large_the_team(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    step = {"positions": [[12, 13 + i] for i in range(8)], "solved": [True] * 3 + [False] * 37}
+    show({"steps": [step, step | {"actions": ["right"] * 7 + ["stay"], "total": [0.25] * 8}],
+          "makespan": None, "moves": 7, "true_moves": 7})
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert "…" not in out
+    assert [out.count(word) for word in ("right", "stay", "(12,20)", "xxx.......", "+0.2500")] == [
+        7, 1, 2, 2, 8]
+    show({"steps": [{"positions": [[0, 0], [1, 0]], "solved": [True, False]}], "makespan": None,
+          "moves": 0, "true_moves": 0})
+    assert "(0,0) (1,0)" in capsys.readouterr().out, "side by side where that fits"
 
 
 def test_missing_files(files, capsys):

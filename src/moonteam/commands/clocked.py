@@ -139,22 +139,21 @@ def ways_of(case: Case, plan: TimedPlan, agent: int) -> list[tuple[Any, Floats, 
 def show(case: Case, plan: TimedPlan) -> None:
     """The schedule as a table, and what is proved about it."""
     from rich.console import Console
-    from rich.table import Table
+
+    from moonteam.report.tables import parts, show_rows
 
     console, unit = Console(), case.unit
     if plan.status == "infeasible":
         console.print(f"{case.title}: no plan: {plan.reason}", soft_wrap=True, highlight=False)
         return
-    table = Table(title=f"{case.title}: {plan.planner}, {plan.objective}, by the clock")
-    for column in (f"starts, {unit}", f"ends, {unit}"):
-        table.add_column(column, justify="right")
-    for column in ("target", "place", "served by"):
-        table.add_column(column)
+    rows = []
     for one in plan.services:
         x, y = case.places[one.target]
-        table.add_row(f"{one.start / MS:.1f}", f"{one.end / MS:.1f}", case.targets[one.target],
-                      f"{x:g}, {y:g}", " with ".join(case.agents[a] for a in one.agents))
-    console.print(table)
+        rows.append([f"{one.start / MS:.1f}", f"{one.end / MS:.1f}", case.targets[one.target],
+                     f"{x:g}, {y:g}", parts([case.agents[a] for a in one.agents], "with")])
+    times = (f"starts, {unit}", f"ends, {unit}")
+    show_rows(console, [*times, "target", "place", "served by"], rows,
+              f"{case.title}: {plan.planner}, {plan.objective}, by the clock", times)
     assert plan.makespan is not None
     assert plan.effort is not None
     console.print(f"makespan {plan.makespan / MS:.1f} {unit}, {plan.effort / MS:.1f} {unit} of "

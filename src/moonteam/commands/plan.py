@@ -14,6 +14,7 @@ from moonteam.planners.base import Plan, Snapshot
 from moonteam.problem import scenario, timed
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
+from moonteam.problem.skills import held
 from moonteam.problem.timed import Timed
 from moonteam.report.progress import busy
 
@@ -109,27 +110,22 @@ def make_plan(args: Args, snapshot: Snapshot) -> Plan:
 def print_plan(case: Case, plan: Plan, alpha: float, beta: float) -> None:
     """The schedule as a table, and one line about the plan."""
     from rich.console import Console
-    from rich.table import Table
+
+    from moonteam.report.tables import parts, show_rows
 
     console = Console()
     if plan.status == "infeasible":
         console.print(f"{case.title}: no plan: {plan.reason}", soft_wrap=True, highlight=False)
         return
-    table = Table(title=f"{case.title}: {plan.planner}, {plan.objective}")
-    table.add_column("step", justify="right")
-    table.add_column("target")
-    table.add_column("cell", justify="right")
-    table.add_column("needs")
-    table.add_column("solved by")
+    rows = []
     for visit in plan.schedule:
         target = case.scenario.targets[visit.target]
-        word = f" {target.type} " if len(set(target.skills)) > 1 else ""
-        team = (f"{case.agents[a]} ({''.join(case.scenario.agents[a].skills)})"
-                for a in visit.agents)
-        table.add_row(str(visit.step), case.targets[visit.target],
-                      f"{target.at[0]}, {target.at[1]}", word.join(target.skills),
-                      " with ".join(team))
-    console.print(table)
+        team = [f"{case.agents[a]} ({held(case.scenario.agents[a].skills)})" for a in visit.agents]
+        rows.append([str(visit.step), case.targets[visit.target],
+                     f"{target.at[0]}, {target.at[1]}",
+                     parts(dict.fromkeys(target.skills), target.type), parts(team, "with")])
+    show_rows(console, ["step", "target", "cell", "needs", "solved by"], rows,
+              f"{case.title}: {plan.planner}, {plan.objective}", ("step", "cell"))
     walks = (plan.actions != scenario.ACTIONS.index("stay")).sum(0).tolist()
     each = ", ".join(f"{name} {count}" for name, count in zip(case.agents, walks, strict=True))
     console.print(f"makespan {plan.makespan} steps, {plan.moves} moves ({each})",

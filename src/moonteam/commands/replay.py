@@ -19,6 +19,8 @@ from moonteam.strict import json_value
 
 FILES = ("replay.json",)
 """In --out."""
+TEN = 10
+"""Targets whose marks stand together."""
 
 
 @dataclass(frozen=True)
@@ -142,19 +144,19 @@ def trace(problem: Scenario, actions: list[list[int]], args: Args) -> dict[str, 
 
 
 def show(document: dict[str, Any]) -> None:
-    """A table on standard output, one line a step."""
+    """A table on standard output: one line a step, or, where that is too wide, an agent."""
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table("step", "actions", "positions", "solved", "total reward", title="replay")
+    from moonteam.report.tables import show_rows
+
+    rows = []
     for t, row in enumerate(document["steps"]):
-        table.add_row(
-            str(t), " ".join(row.get("actions", [])),
-            " ".join(f"({x},{y})" for x, y in row["positions"]),
-            "".join("x" if solved else "." for solved in row["solved"]),
-            " ".join(f"{total:+.4f}" for total in row.get("total", [])))
+        marks = "".join("x" if solved else "." for solved in row["solved"])
+        rows.append([str(t), row.get("actions", []), [f"({x},{y})" for x, y in row["positions"]],
+                     [marks[k:k + TEN] for k in range(0, len(marks), TEN)],
+                     [f"{total:+.4f}" for total in row.get("total", [])]])
     console = Console()
-    console.print(table)
+    show_rows(console, ["step", "actions", "positions", "solved", "total reward"], rows, "replay")
     makespan = document["makespan"]
     ended = f"all solved at step {makespan}" if makespan is not None else "not all solved"
     console.print(f"{ended}; {document['moves']} moves, {document['true_moves']} of them changed "

@@ -20,7 +20,6 @@ from sim2grid.show.picture import (
     TargetMark,
     hillshade,
     requirement,
-    skills_of,
 )
 from sim2grid.show.studio import Shooting
 from sim2grid.show.take import Actor, Style, Take, planned_ways
@@ -143,12 +142,12 @@ def test_skills_with_names_stand_apart(mission):
     import msgspec
 
     spec = mission(["a drone A 0 0", "b legged AB 1 1"], ["AB AND 1 0", "AB OR 2 2"])
-    target, robot = spec.targets[0], spec.robots[1]
+    target = spec.targets[0]
     assert (requirement(target), requirement(spec.targets[1])) == ("A+B", "A/B")
-    assert skills_of(robot) == "AB"
     named = msgspec.structs.replace(target, skills=("camera", "radio"))
     assert requirement(named) == "camera + radio"
-    assert skills_of(msgspec.structs.replace(robot, skills=("camera", "radio"))) == "camera, radio"
+    two = msgspec.structs.replace(target, skills=(), coalition={"A": 2, "B": 1})
+    assert requirement(two) == "2 A + B"
 
 
 def test_hillshade_lights_slopes_that_face_north_west():

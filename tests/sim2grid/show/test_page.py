@@ -4,6 +4,7 @@ import colorsys
 import re
 from html.parser import HTMLParser
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -73,6 +74,21 @@ def test_a_rollouts_page_is_whole_and_needs_nothing_else(done, tmp_path):
     assert {"video", "img", "table"} <= set(read.tags)
     for word in ("success", "2 of 2", "a slowed", "moonteam rollout demo", "T1", "wheeled"):
         assert word in read.text
+
+
+def test_skills_stand_as_in_the_pictures(done, tmp_path):
+    """Letters close together, names apart."""
+    report, _ = done
+    replace = msgspec.structs.replace
+    first, second = report.targets
+    robot, other = report.robots
+    text = Reader(page.rollout_page(replace(
+        report, targets=(replace(first, skills=("camera", "radio"), type="AND"),
+                         replace(second, skills=("A", "B"), type="OR")),
+        robots=(replace(robot, skills=("camera", "radio")), replace(other, skills=("A", "B")))),
+        command="", made=None, out=tmp_path)).text
+    for words in (" camera + radio ", " A/B ", " camera, radio ", " AB "):
+        assert words in text
 
 
 def test_words_from_outside_are_escaped():

@@ -19,6 +19,7 @@ from moonteam import files
 from moonteam.planners.base import IntArray, Plan, Snapshot
 from moonteam.planners.simulate import replay
 from moonteam.problem.scenario import Scenario
+from moonteam.problem.skills import held, needed
 
 COLOURS = ("#1485b8", "#b89514", "#a114b8", "#14b886", "#b85a14", "#1424b8",
            "#73b814", "#b81449")
@@ -106,15 +107,23 @@ def _targets(axes: Any, scenario: Scenario, plan: Plan, names: Sequence[str],
             (x - 0.55, y - 0.5), 1.1, 1.0, boxstyle="round,pad=0.12,rounding_size=0.3",
             facecolor="white", edgecolor=edge, linewidth=1.8,
             linestyle="-" if visit else ":", zorder=4, clip_on=False))
-        word = ("&" if both else "|").join(target.skills)
-        axes.text(x, y, word, ha="center", va="center_baseline",
-                  fontsize=size * min(1.0, 2.6 / len(word)),
-                  fontweight="bold", color=INK, zorder=5)
+        _inside(axes, (x, y), needed(target.skills, not both), size, INK, 5)
         label = names[j] + (f" @{visit.step}" if visit else "")
         dx, dy, align = _beside(x, y, scenario.size, taken, len(label))
         axes.text(x + dx, y + dy, label, ha=align, va="center", fontsize=size * 0.85, color=INK,
                   zorder=6, bbox={"boxstyle": "round,pad=0.15", "facecolor": PAPER,
                                   "edgecolor": "none", "alpha": 0.8})
+
+
+def _inside(axes: Any, at: tuple[float, float], skills: str, size: float, colour: str,
+            zorder: int) -> None:
+    """Skills on a mark, which has room for two or three letters: names one a line, smaller."""
+    for sign in (" + ", " / ", ", "):
+        skills = skills.replace(sign, f"\n{sign.strip(' ,')}")
+    longest = max(map(len, skills.splitlines()))
+    axes.text(*at, skills, ha="center", va="center" if "\n" in skills else "center_baseline",
+              fontsize=size * min(1.0, 2.6 / longest), fontweight="bold", color=colour,
+              zorder=zorder)
 
 
 def _beside(x: int, y: int, size: tuple[int, int], taken: Sequence[tuple[int, int]],
@@ -143,9 +152,8 @@ def _starts(axes: Any, scenario: Scenario, size: float) -> None:
         seen[agent.at] = seen.get(agent.at, 0) + 1
         axes.scatter([agent.at[0] + shift], [agent.at[1] + shift], s=(2.0 * size) ** 2 * 0.75,
                      color=COLOURS[a % len(COLOURS)], edgecolor="white", linewidth=1.4, zorder=7)
-        axes.text(agent.at[0] + shift, agent.at[1] + shift, "".join(agent.skills), ha="center",
-                  va="center_baseline", color="white", fontweight="bold", fontsize=size * 0.85,
-                  zorder=8)
+        _inside(axes, (agent.at[0] + shift, agent.at[1] + shift), held(agent.skills), size * 0.85,
+                "white", 8)
 
 
 def _sidebar(axes: Any, scenario: Scenario, plan: Plan, agents: Sequence[str],
@@ -155,9 +163,9 @@ def _sidebar(axes: Any, scenario: Scenario, plan: Plan, agents: Sequence[str],
     axes.set_xlim(0, 1)
     lines: list[tuple[str, str, bool]] = []
     for a, agent in enumerate(scenario.agents):
-        kind = f", {agent.kind}" if agent.kind else ""
+        kind = f" ({agent.kind})" if agent.kind else ""
         colour = COLOURS[a % len(COLOURS)]
-        lines.append((f"{agents[a]}  {'+'.join(agent.skills)}{kind}", colour, True))
+        lines.append((f"{agents[a]}  {held(agent.skills)}{kind}", colour, True))
         mine = [v for v in plan.schedule if a in v.agents]
         for visit in mine:
             others = [agents[b] for b in visit.agents if b != a]
@@ -173,7 +181,7 @@ def _sidebar(axes: Any, scenario: Scenario, plan: Plan, agents: Sequence[str],
         axes.text(0.0, y, text, color=colour, fontsize=min(9.5, 360 * step), va="top",
                   fontweight="bold" if heading else "normal", transform=axes.transAxes)
         y -= step
-    note = "disc: start and skills\nA&B: all skills at once\nA|B: any of them\n@: step when solved"
+    note = "disc: start and skills\nA+B: all skills at once\nA/B: any of them\n@: step when solved"
     if plan.reason:
         note = textwrap.fill(plan.reason, 34)
     closed = [kind for kind, cells in (scenario.blocked or {}).items() if cells]
