@@ -5,16 +5,15 @@ Plain functions from data to text; every word from outside goes through `html.es
 
 from __future__ import annotations
 
-import base64
 import html
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from moonteam import files
 from moonteam.problem.skills import held, needed
+from moonteam.report.markup import Raw, cell, data_uri, table
 from sim2grid.measure.metrics import Optimum, Report
 from sim2grid.show.picture import robot_color
 from sim2grid.show.plots import hexed
@@ -66,48 +65,12 @@ svg.map{width:100%;border-radius:6px}.gantt text{font-size:11px}.map text{font-w
 """
 
 
-@dataclass(frozen=True)
-class Raw:
-    """Text that is HTML already."""
-
-    text: str
-
-
 def page(title: str, parts: Iterable[str]) -> str:
     """A whole document."""
     return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
             f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style></head>\n<body>\n"
             + "\n".join(part for part in parts if part) + "\n</body></html>\n")
-
-
-def cell(value: object, digits: int = 2) -> str:
-    """A value for a person: a dash for none, few digits for numbers, escaped words."""
-    if isinstance(value, Raw):
-        return value.text
-    if value is None or (isinstance(value, float) and value != value):
-        return '<span class="dim">-</span>'
-    if isinstance(value, bool):
-        return f'<span class="{"good" if value else "bad"}">{"yes" if value else "no"}</span>'
-    if isinstance(value, float):
-        return f"{value:,.{digits}f}"
-    return html.escape(str(value))
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table; columns whose values are all numbers stand to the right."""
-    body = [list(row) for row in rows]
-    numbers = [bool(body) and all(isinstance(row[k], (int, float, type(None))) and not
-                                  isinstance(row[k], bool) for row in body)
-               for k in range(len(head))]
-    kind = [' class="n"' if number else "" for number in numbers]
-    top = "".join(f"<th{k}>{html.escape(word)}</th>" for k, word in zip(kind, head, strict=True))
-    # A narrow screen shows a row as a list: the titles go with the cells.
-    said = [f' data-title="{html.escape(word)}"' for word in head]
-    lines = "\n".join("<tr>" + "".join(f"<td{k}{t}>{cell(v)}</td>" for k, t, v in zip(
-        kind, said, row, strict=True)) + "</tr>" for row in body)
-    return f'<div class="wide"><table><thead><tr>{top}</tr></thead>\n<tbody>{lines}</tbody>' \
-           "</table></div>"
 
 
 def known(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -122,11 +85,6 @@ def tiles(pairs: Iterable[tuple[str, object]]) -> str:
     return '<div class="tiles">' + "".join(
         f'<div class="tile"><b>{cell(value)}</b><span>{html.escape(name)}</span></div>'
         for name, value in pairs) + "</div>"
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    """A file's content as an address."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def plot(svg: str, alt: str) -> str:

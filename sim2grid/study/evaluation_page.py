@@ -9,8 +9,9 @@ import html
 from collections.abc import Callable
 from typing import Any
 
+from moonteam.report.markup import Raw, table
 from sim2grid.show import plots
-from sim2grid.show.page import Raw, folded, known, mean_interval, page, plot, table, tiles
+from sim2grid.show.page import folded, known, mean_interval, page, plot, tiles
 from sim2grid.study.mission_cards import cards, optimum, rollout_command
 from sim2grid.study.summary import COMPARED, DIFFERENT, compared_rows, different_rows, where
 

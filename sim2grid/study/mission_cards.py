@@ -23,8 +23,9 @@ from PIL import Image
 from moonteam import files
 from moonteam.errors import InputError
 from moonteam.problem.mission import Map, Mission, Site, Target
+from moonteam.report.markup import Raw
 from moonteam.terrain.site import for_mission
-from sim2grid.show.page import Raw, known
+from sim2grid.show.page import known
 from sim2grid.show.picture import (
     GREY,
     INK,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 from typing import TYPE_CHECKING, Any
 
+from moonteam.report.markup import table
 from sim2grid.show import plots
-from sim2grid.show.page import folded, mean_interval, page, plot, table, tiles
+from sim2grid.show.page import folded, mean_interval, page, plot, tiles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import importlib
 import json
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from moonteam import files
 from moonteam.errors import InputError
+from moonteam.report.markup import data_uri, table
 
 if TYPE_CHECKING:
     from sim2grid.loop.record import Record
@@ -189,25 +189,14 @@ class Rollout:
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    top = "".join(f"<th>{html.escape(word)}</th>" for word in head)
-    body = "".join("<tr>" + "".join(f"<td>{_cell(value)}</td>" for value in row) + "</tr>"
-                   for row in rows)
-    return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _cell(value: object) -> str:
-    if value is None or value != value:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
+    return table(head, rows, lambda value: f"{value:.4g}")
 
 
 def _inside(path: Path | None, kind: str) -> str:
     """A file's content as an address; empty where it is not there, or too large."""
     if path is None or not path.is_file() or path.stat().st_size > LARGEST_VIDEO:
         return ""
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    return data_uri(path.read_bytes(), kind)
 
 
 def _picture(path: Path) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from moonteam.planners.plans import figure
-from moonteam.report import video
+from moonteam.report import markup, video
 from sim2grid.frame import Frame
 from sim2grid.measure.metrics import GridPlan, make_report
 from sim2grid.measure.story import Story
@@ -92,18 +92,18 @@ def test_skills_stand_as_in_the_pictures(done, tmp_path):
 
 
 def test_words_from_outside_are_escaped():
-    assert page.cell("<b>&") == "&lt;b&gt;&amp;"
-    assert page.cell(page.Raw("<b>")) == "<b>"
-    assert "<script>" not in page.page("<script>", [page.table(["<script>"], [["<script>"]])])
+    assert markup.cell("<b>&") == "&lt;b&gt;&amp;"
+    assert markup.cell(markup.Raw("<b>")) == "<b>"
+    assert "<script>" not in page.page("<script>", [markup.table(["<script>"], [["<script>"]])])
 
 
 def test_cells_for_a_person():
-    assert page.cell(1234.567) == "1,234.57"
-    assert "-" in page.cell(None)
-    assert "-" in page.cell(float("nan"))
-    assert "yes" in page.cell(True)
-    assert 'class="n"' in page.table(["x"], [[1.0], [None]])
-    assert 'class="n"' not in page.table(["x"], [[1.0], ["one"]])
+    assert markup.cell(1234.567) == "1,234.57"
+    assert "-" in markup.cell(None)
+    assert "-" in markup.cell(float("nan"))
+    assert "yes" in markup.cell(True)
+    assert 'class="n"' in markup.table(["x"], [[1.0], [None]])
+    assert 'class="n"' not in markup.table(["x"], [[1.0], ["one"]])
 
 
 def test_a_large_video_is_linked_and_a_missing_one_said(tmp_path, monkeypatch):
