@@ -100,6 +100,17 @@ def test_a_second_signal_leaves_at_once():
     assert seconds < 1.0 + BUSY
 
 
+def test_what_is_let_go_of_is_not_waited_for_and_what_runs_beside_is_ended():
+    work = """
+    interrupts.hold()
+    interrupts.release()
+    with interrupts.leaving(lambda: print("ended", flush=True)):
+        compiled(ENDLESS)"""
+    code, out, err, seconds = run(work.strip().replace("ENDLESS", str(ENDLESS - 1)), signal.SIGINT)
+    assert (code, out, err) == (130, "ended\n", "moonteam: interrupted\n")
+    assert seconds < 1.0 + BUSY
+
+
 def test_between_two_pieces_the_first_signal_only_asks():
     work = """
     interrupts.hold()

@@ -105,7 +105,7 @@ def again(path: Path, who: Who) -> str:
     from sim2grid.commands import rollout
 
     return command.line("rollout", rollout.Args(
-        mission=str(path), planner=who.planner, policy=who.policy, time_limit=who.time_limit,
+        mission=(str(path),), planner=who.planner, policy=who.policy, time_limit=who.time_limit,
         mode=who.mode, backend="native", seed=who.seed)) + " --no-video"
 
 

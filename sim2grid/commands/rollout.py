@@ -1,13 +1,14 @@
-"""`moonteam rollout`: a mission in physics, from the file to video and report."""
+"""`moonteam rollout`: missions in physics, from the file to video and report."""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
@@ -22,8 +23,10 @@ from moonteam.errors import InputError
 from moonteam.problem.mission import Mission
 from moonteam.report import command
 from moonteam.report.command import Aside
-from moonteam.report.progress import bar, say
+from moonteam.report.progress import bar, say, track
 from moonteam.version import __version__
+from sim2grid.commands import filming, words
+from sim2grid.commands.filming import PLAIN_S, Filmed
 
 if TYPE_CHECKING:
     from moonteam.planners.base import Planner
@@ -34,48 +37,21 @@ if TYPE_CHECKING:
     from sim2grid.measure.metrics import GridPlan, Optimum, Report
     from sim2grid.show.film import Film
     from sim2grid.show.studio import Shooting
-    from sim2grid.show.take import Style, Take
 
 FILES = ("report.html", "video.mp4", "video.webp", "video.gif", "map.mp4", "map.webp", "map.gif",
          "paths.png", "report.json", "timing.json",
          "config.json")
 """In --out."""
-PLAIN_S = 10.0
-"""Between two lines on how far it is, where standard error is no terminal."""
-
-
-@dataclass(frozen=True)
-class Filmed:
-    """How the film is made."""
-
-    size: Aside[tuple[int, int]] = (1280, 720)
-    """Width and height of the film, pixels, both even."""
-    fps: Aside[float] = 30.0
-    """Pictures a second."""
-    seconds: Aside[float] = 24.0
-    """Length of the film, title and end included; shorter where the mission is."""
-    speed: Aside[float | None] = None
-    """How fast wide pictures run, close ones being at true speed; the film is as long as that
-    takes. Default: as --seconds asks for."""
-    camera: Aside[str] = "auto"
-    """auto cuts from wide pictures to whatever happens; wide, chase, or the name of a robot: one
-    camera all the time, which goes along with it."""
-    shadows: Aside[bool] = True
-    """Robots cast shadows."""
-    layout: Aside[Literal["inset", "clean", "map"]] = "inset"
-    """inset: the map and the lists lie over the picture; clean: names alone; map: no 3-D picture,
-    the map fills the film."""
-    also: Aside[tuple[Literal["webp", "gif"], ...]] = ()
-    """The film once more, small, for a README."""
 
 
 @dataclass(frozen=True)
 class Args(Filmed, Planning, Forced, Printed):
-    """Run a mission in physics: a video, a map of the paths and a report.
+    """Run missions in physics: a video, a map of the paths and a report of each.
 
     The planner decides on the grid; every move becomes a waypoint that a simulated robot has to
     reach over lunar ground; where the robots really are is what the planner sees next.
-    Exit code 0 if every target was solved, 1 if the mission failed.
+    Exit code 0 if every target was solved, 1 if a mission failed. The film of one mission is drawn
+    while the next is under way.
 
     Files in the output folder: report.html (all of it on one page), video.mp4 (map.mp4 where no
     3-D pictures can be made, or wanted; .webp and .gif with --also), paths.png, report.json (the
@@ -84,14 +60,15 @@ class Args(Filmed, Planning, Forced, Printed):
     Examples:
       moonteam rollout demo
       moonteam rollout outpost --planner exact --backend native --out runs/exact
+      moonteam rollout demo outpost sampling --backend native --planner exact
       moonteam rollout my_mission.yaml --planner exact --no-video --json
       moonteam rollout demo --planner exact --backend native --viewer
       moonteam rollout demo --camera strider --seconds 12 --size 854 480 --also webp
       moonteam rollout --from runs/execution/report.json --mission 17
     """
 
-    mission: tyro.conf.Positional[str] = ""
-    """Mission file (.yaml) or the name of a bundled mission; not with --from."""
+    mission: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Mission files (.yaml) or names of bundled missions; not with --from."""
     planner: str | None = None
     """Who decides: a registered planner (policy, auto, exact, greedy, lns, cpsat, exhaustive,
     another package's), or FILE.py:OBJECT. Default: policy; by the clock exact."""
@@ -113,7 +90,8 @@ class Args(Filmed, Planning, Forced, Printed):
     contender: str | None = None
     """Whose run of it, a name in --from such as "closed exact barrier"; the first by default."""
     out: Aside[Path | None] = None
-    """Output folder; runs/NAME by default, or runs/NAME-2 and so on where that holds a rollout."""
+    """Output folder, of several missions OUT/NAME each; runs/NAME by default, or runs/NAME-2 and so
+    on where that holds a rollout."""
     video: Aside[bool] = True
     """Make the video."""
     viewer: Aside[bool] = False
@@ -160,25 +138,34 @@ class Done:
 
 
 def run(args: Args) -> int:
-    """Runs the mission, writes its folder, prints; the exit code says whether it succeeded."""
-    done = carry_out(args)
-    report, before = done.report, done.made.before
-    if done.interrupted:
-        print(f"moonteam: stopped after {report.seconds:g} s of the mission; "
-              f"{done.out}/report.json holds what was done", file=sys.stderr)
-        return interrupts.CODE
+    """Runs the missions, writes their folders, prints; the exit code says whether all succeeded."""
+    reports: list[Report] = []
+    with contextlib.closing(carry_out(args)) as each:
+        for done in each:
+            report, before = done.report, done.made.before
+            if done.interrupted:
+                print(f"moonteam: stopped after {report.seconds:g} s of the mission; "
+                      f"{done.out}/report.json holds what was done", file=sys.stderr)
+                return interrupts.CODE
+            reports.append(report)
+            if not args.json:
+                words.show(report, done.timing, done.out, done.video)
+            if before is not None and report != before:
+                print(f"moonteam: not as in {args.report}: {words.difference(before, report)}; "
+                      "another machine or other versions?", file=sys.stderr)
+    solved, several = sum(report.success for report in reports), len(args.mission) > 1
     if args.json:
-        print(files.dump_json(report))
-    else:
-        _show(report, done.timing, done.out, done.video)
-    if before is not None and report != before:
-        print(f"moonteam: not as in {args.report}: {_difference(before, report)}; another "
-              "machine or other versions?", file=sys.stderr)
-    return 0 if report.success else 1
+        print(files.dump_json(reports if several else reports[0]))
+    elif several:
+        print(f"{solved} of {len(reports)} missions succeeded")
+    return 0 if solved == len(reports) else 1
 
 
-def carry_out(args: Args) -> Done:
-    """Runs the mission and writes its folder. Raises InputError before anything is written."""
+def carry_out(args: Args) -> Generator[Done, None, None]:
+    """Runs the missions; gives each out once its folder is whole, and the one that was stopped.
+
+    Raises InputError for whatever is wrong with any of them before anything is written.
+    """
     _check(args)
     from moonteam.compilation import call_at_once, enable_cache
 
@@ -188,11 +175,8 @@ def carry_out(args: Args) -> Done:
         from sim2grid.show.viewer import check_display
 
         check_display()
-    made = _from_file(args) if args.report is None else _from_report(args)
-    _check_camera(args, made.prepared.mission)
-    out = folder(made.prepared.mission.name, args.out, args.force)
-    with outputs.folder(out, FILES, force=args.force):
-        return _carry_out(args, made, out)
+    with contextlib.ExitStack() as stack:
+        yield from _in_turn(_jobs(args, stack))
 
 
 def film(made: Run, best: Optimum | None, path: Path) -> None:
@@ -200,8 +184,8 @@ def film(made: Run, best: Optimum | None, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         args, take = Filmed(), _film(made, best).take
-        with _begin_video(args, take, made.prepared, Path(folder)) as shooting:
-            os.replace(_end_video(args, shooting, {}), path)
+        with filming.begin(args, take, made.prepared, Path(folder)) as shooting:
+            os.replace(filming.end(args, shooting, {}), path)
 
 
 def folder(mission: str, out: Path | None, force: bool) -> Path:
@@ -210,30 +194,152 @@ def folder(mission: str, out: Path | None, force: bool) -> Path:
     return out or (default if force else outputs.free(default, FILES))
 
 
-def _carry_out(args: Args, made: Run, out: Path) -> Done:
-    _begin_folder(out, args, made)
-    print(f"moonteam: engine {made.backend}: {made.why}", file=sys.stderr)
-    best, interrupted = made.best(), False
+def _folders(args: Args, missions: list[str]) -> list[Path]:
+    """Those of missions of these names, no two the same."""
+    if len(missions) == 1:
+        return [folder(missions[0], args.out, args.force)]
+    asked, found = args.out is not None or args.force, list[Path]()
+    for mission in missions:
+        first = (args.out or Path("runs")) / files.safe_name(mission, "mission")
+        numbered = (first.with_name(f"{first.name}-{count}") for count in itertools.count(2))
+        found.append(next(path for path in itertools.chain([first], numbered) if path not in found
+                          and (asked or outputs.free(path, FILES) == path)))
+    return found
+
+
+@dataclass
+class _Job:
+    """One mission of the command."""
+
+    args: Args  # with this mission alone
+    made: Run
+    out: Path
+    held: contextlib.ExitStack  # closed when the folder is whole
+    about: str  # among several, a line as it begins
+    best: Optimum | None = None
+
+
+@dataclass
+class _Driven:
+    """A job whose physics is over."""
+
+    job: _Job
+    report: Report
+    timing: dict[str, float]
+    film: Film
+    interrupted: bool
+    shooting: Shooting | None = None  # once the film is begun, if there is to be one
+
+    @property
+    def whole(self) -> bool:
+        """Whether its film is there."""
+        return self.shooting is not None and self.shooting.whole
+
+    def stop(self) -> None:
+        """Ends its film, unless that is there."""
+        if self.shooting is not None:
+            self.shooting.stop()
+
+    def done(self, video: Path | None) -> Done:
+        """What came of it."""
+        return Done(self.job.made, self.report, self.timing, self.job.out, video, self.interrupted)
+
+
+def _jobs(args: Args, stack: contextlib.ExitStack) -> list[_Job]:
+    """All missions with their folders, held until `stack` is closed. Raises InputError."""
+    runs, found = _runs(args), list[_Job]()
+    outs = _folders(args, [made.prepared.mission.name for _, made in runs])
+    for number, ((own, made), out) in enumerate(zip(runs, outs, strict=True), 1):
+        held = stack.enter_context(contextlib.ExitStack())
+        held.enter_context(outputs.folder(out, FILES, force=args.force))
+        about = f"mission {number} of {len(runs)}: {made.prepared.mission.name}, in {out}"
+        found.append(_Job(own, made, out, held, about if len(runs) > 1 else ""))
+    print(f"moonteam: engine {found[0].made.backend}: {found[0].made.why}", file=sys.stderr)
+    # Proved within so many seconds, so before a film takes its share of the processors.
+    for job in track(found, "optimum", len(found)) if len(found) > 1 else found:
+        job.best = job.made.best()
+    return found
+
+
+def _runs(args: Args) -> list[tuple[Args, Run]]:
+    """Each mission ready to be run, with the arguments that ask for it alone."""
+    if args.report is not None:
+        made = _from_report(args)
+        filming.check_camera(args, made.prepared.mission)
+        return [(args, made)]
+    found = []
+    for name in args.mission:
+        own = replace(args, mission=(name,))
+        try:
+            made = _from_file(own)
+            filming.check_camera(own, made.prepared.mission)
+        except InputError as error:
+            if len(args.mission) == 1 or name in str(error):
+                raise
+            raise InputError(name, str(error)) from None
+        found.append((own, made))
+    return found
+
+
+def _in_turn(jobs: list[_Job]) -> Iterator[Done]:
+    """One mission after the other; the film of each is drawn while the next is driven."""
+    filmed: _Driven | None = None  # the one before, if its film is under way
     try:
-        timing = _drive(args, made)
+        while jobs:
+            driven = _drive_and_save(jobs.pop(0), filmed)
+            if filmed is not None:
+                if driven.interrupted and not filmed.whole:
+                    print(f"moonteam: {filmed.job.out}: its film was not finished",
+                          file=sys.stderr)
+                else:
+                    yield _finish(filmed)
+            filmed = None
+            if driven.interrupted:
+                yield driven.done(None)
+                return
+            if driven.job.args.video:
+                filmed = driven
+                filmed.shooting = filming.begin(
+                    driven.job.args, driven.film.take, driven.job.made.prepared, driven.job.out)
+            else:
+                yield _finish(driven)
+        if filmed is not None:
+            yield _finish(filmed)
+    finally:
+        if filmed is not None:
+            filmed.stop()
+
+
+def _drive_and_save(job: _Job, filmed: _Driven | None) -> _Driven:
+    """A mission's physics and its report. Stopped, it stops the film beside it too."""
+    interrupts.release()
+    if job.about:
+        print(f"moonteam: {job.about}", file=sys.stderr)
+    made, out, interrupted = job.made, job.out, False
+    _begin_folder(out, job.args, made)
+    try:
+        timing = _drive(job.args, made)
     except KeyboardInterrupt:
         interrupted, timing = True, {}
-    report = msgspec.structs.replace(_report(made), optimum=best)
+        if filmed is not None:
+            filmed.stop()
+    report = msgspec.structs.replace(_report(made), optimum=job.best)
     files.write_json(out / "report.json", report)
     files.write_json(out / "timing.json", timing)
-    film = _film(made, best)
+    film = _film(made, job.best)
     _save_paths(film, out)
-    if interrupted:
-        return Done(made, report, timing, out, None, True)
-    with contextlib.ExitStack() as stack:
-        shooting = None
-        if args.video:
-            shooting = stack.enter_context(_begin_video(args, film.take, made.prepared, out))
-        plots = _plots(film)  # while the film is being drawn
-        video = _end_video(args, shooting, timing) if shooting is not None else None
-    files.write_json(out / "timing.json", timing)
-    _save_page(made, film, plots, report, timing, out, video)
-    return Done(made, report, timing, out, video, False)
+    return _Driven(job, report, timing, film, interrupted)
+
+
+def _finish(driven: _Driven) -> Done:
+    """Waits for the film if there is one, writes the rest of the folder and lets go of it."""
+    job, shooting = driven.job, driven.shooting
+    plots = _plots(driven.film)  # while the film is being drawn
+    video = None if shooting is None else filming.end(job.args, shooting, driven.timing)
+    files.write_json(job.out / "timing.json", driven.timing)
+    _save_page(job.made, driven.film, plots, driven.report, driven.timing, job.out, video)
+    job.held.close()
+    return driven.done(video)
 
 
 def _check(args: Args) -> None:
@@ -243,7 +349,7 @@ def _check(args: Args) -> None:
     if args.seed < 0:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
     parse(args.decode)
-    _check_film(args)
+    filming.check(args)
     if args.mode == "clock" and args.backend == "fused":
         raise InputError("--backend fused", "drives in steps; by the clock mjx or native")
     if args.backend == "fused" and args.viewer:
@@ -253,37 +359,17 @@ def _check(args: Args) -> None:
         for name, value in (("--mission", args.number), ("--contender", args.contender)):
             if value is not None:
                 raise InputError(name, "says which mission of a report; give --from REPORT too")
-        if not args.mission:
+        if not any(args.mission):
             raise InputError("rollout", "give a mission file, the name of a bundled "
                              "mission, or --from REPORT --mission N")
         return
     if args.mission:
-        raise InputError("--from", f"give a report or the mission {args.mission}, not both")
+        raise InputError("--from", f"give a report or the mission {args.mission[0]}, not both")
     if args.number is None:
         raise InputError("--from", "give the number of the mission too: --mission N")
     for field in fields(args):
         if field.name in FROM_REPORT and getattr(args, field.name) != field.default:
             raise InputError(f"--{field.name}", "not with --from: the report says it")
-
-
-def _check_film(args: Filmed) -> None:
-    """What can be said of the film's options alone. Raises InputError."""
-    if any(n % 2 or not 160 <= n <= 3840 for n in args.size):
-        raise InputError("--size", f"{args.size[0]} {args.size[1]} is not allowed; both even, "
-                         "from 160 to 3840")
-    for name, value, least, most in (
-            ("--fps", args.fps, 1, 120), ("--seconds", args.seconds, 1, 3600),
-            ("--speed", args.speed, 0.1, 1000)):
-        if value is not None and not least <= value <= most:
-            raise InputError(name, f"{value:g} is not allowed; from {least:g} to {most:g}")
-
-
-def _check_camera(args: Filmed, mission: Mission) -> None:
-    """Raises InputError for a camera that goes along with nobody."""
-    allowed = ["auto", "wide", "chase", *(robot.name for robot in mission.robots)]
-    if args.camera not in allowed:
-        raise InputError("--camera", f"no such camera or robot: {args.camera}; allowed: "
-                         + ", ".join(allowed))
 
 
 def _from_file(args: Args) -> Run:
@@ -292,17 +378,18 @@ def _from_file(args: Args) -> Run:
     from sim2grid.loop.execution import Execution
     from sim2grid.loop.prepare import prepare
 
-    mission, _ = loading.read_mission(args.mission)
+    [source] = args.mission
+    mission, _ = loading.read_mission(source)
     args, why = _with_engine(args)
     mode = args.mode or ("clock" if mission.clock == "seconds" else "barrier")
     if mode == "clock":
         return _by_the_clock(args, mission, why)
     if mission.clock == "seconds":
-        raise InputError(args.mission, "is by the clock, which --mode clock alone executes",
+        raise InputError(source, "is by the clock, which --mode clock alone executes",
                          "clock")
     name = args.planner or "policy"
     planner = registry.make(name, args.planner_options())
-    prepared = prepare(mission, args.mission)
+    prepared = prepare(mission, source)
     plan, trace = _grid_plan(prepared, planner, args.seed)
     execution = Execution(prepared.mission, prepared.scenario, planner, prepared.bodies,
                           prepared.frame, seed=args.seed, mode=mode)
@@ -338,9 +425,10 @@ def _by_the_clock(args: Args, mission: Mission, why: str) -> Run:
     from sim2grid.loop.prepare import prepare
     from sim2grid.measure import optimum
 
+    [source] = args.mission
     name = args.planner or "exact"
     _check(replace(args, planner=name, mode="clock"))
-    prepared = prepare(by_the_clock(mission, args.mission), args.mission)
+    prepared = prepare(by_the_clock(mission, source), source)
     planner = registry.find(name).make(args.planner_options(args.seed))
     execution = execution_of(prepared, Keeper(planner), args.seed)
     who = name if name != "policy" else f"policy {Path(args.policy).stem}"
@@ -387,7 +475,7 @@ def _best(prepared: Prepared, trace: Trace) -> Optimum | None:
 def _begin_folder(out: Path, args: Args, made: Run) -> None:
     outputs.clear(out, FILES)
     options = {key: value for key, value in asdict(args).items()
-               if key not in ("out", "json", "force")}
+               if key not in ("out", "json", "force")} | {"mission": "".join(args.mission)}
     files.write_json(out / "config.json", {
         "moonteam": __version__, "options": options, "engine": f"{made.backend}: {made.why}",
         "mission": msgspec.to_builtins(made.prepared.written)})
@@ -503,90 +591,3 @@ def _save_paths(film: Film, out: Path) -> None:
     from sim2grid.show import plots
 
     plots.save_png(plots.paths(film.story, film.take.ground, film.take.barred), out / "paths.png")
-
-
-def _style(args: Filmed) -> Style:
-    from sim2grid.show.take import Style
-
-    return Style(args.size, args.fps, args.seconds, args.speed, args.camera, args.shadows,
-                 args.layout)
-
-
-def _begin_video(args: Filmed, take: Take, prepared: Prepared, out: Path) -> Shooting:
-    """Begins video.mp4 in processes of its own; map.mp4 where there is nothing to render with,
-    with a word about why.
-    """
-    from moonteam.physics.render import RenderingUnavailable
-    from sim2grid.show.studio import Shooting
-
-    name = "map.mp4"
-    if args.layout != "map":
-        from moonteam.physics import stage
-
-        try:
-            stage.check()
-            tops = prepared.site.surface.tops
-            take = replace(take, model=stage.painted(prepared.scene),
-                           tops=take.ground.heights if tops is None else _array(tops))
-            name = "video.mp4"
-        except RenderingUnavailable as error:
-            print(f"moonteam: {error}", file=sys.stderr)
-            print("moonteam: no 3-D video; making map.mp4 instead", file=sys.stderr)
-    return Shooting(take, _style(args), out / name)
-
-
-def _array(values: object) -> npt.NDArray:
-    import numpy as np
-
-    return np.asarray(values)
-
-
-def _end_video(args: Filmed, shooting: Shooting, timing: dict[str, float]) -> Path:
-    """Waits for the film; writes it once more as is asked for."""
-    from moonteam.report import video
-
-    with bar("video", shooting.num_frames, plain_s=PLAIN_S) as update:
-        cost = shooting.wait(lambda done: update(done, shooting.path.name))
-    timing |= cost.timing()
-    for kind in args.also:
-        video.for_readme(shooting.path, shooting.path.with_suffix(f".{kind}"))
-    return shooting.path
-
-
-def _difference(before: Report, now: Report) -> str:
-    """The first figure in which two reports differ."""
-    for name in before.__struct_fields__:
-        if getattr(before, name) != getattr(now, name):
-            if isinstance(getattr(now, name), tuple):
-                return f"{name} differ"
-            return f"{name} was {getattr(before, name)}, is {getattr(now, name)}"
-    return "nothing"
-
-
-def _show(report: Report, timing: dict[str, float], out: Path, video: Path | None) -> None:
-    """The report for a person."""
-    print(f"{report.mission}: {'success' if report.success else 'FAILED'}"
-          + (f" ({report.cause}: {report.detail})" if not report.success else ""))
-    grid = report.grid_plan.makespan if report.grid_plan else None
-    print(f"  {report.seconds:.1f} s of mission, {report.decisions} decisions"
-          + (f" (grid plan: {grid})" if grid is not None else "")
-          + f", {report.moves} moves, {report.planner}, {report.mode}, {report.backend}")
-    if report.optimum is not None:
-        from sim2grid.measure import optimum
-
-        print(f"  at the start: {optimum.words(report.optimum)}")
-    for target in report.targets:
-        by = ", ".join(f"{name} at {distance:.2f} m" for name, distance
-                       in zip(target.robots, target.distance_m, strict=True))
-        print(f"  target {target.name:<10} " + (
-            f"solved at decision {target.decision}, {target.time_s:.1f} s, by {by}"
-            if target.solved else "not solved"))
-    for robot in report.robots:
-        per_move = "-" if robot.seconds_per_move is None else f"{robot.seconds_per_move:.1f} s"
-        print(f"  robot {robot.name:<11} {robot.kind:<8} {robot.moves} moves, {per_move} each, "
-              f"{robot.distance_m:.1f} m, tilt to {robot.max_tilt_deg:.0f} deg"
-              + (f", LOST: {robot.lost} at {robot.lost_s:.1f} s" if robot.lost else ""))
-    if "real_time_factor" in timing:
-        print(f"  {timing['compile_s']:.1f} s to compile, then "
-              f"{timing['real_time_factor']:.1f} times real time")
-    print(f"  {out / 'report.html'}" + (f", {video}" if video else ""))

@@ -23,6 +23,7 @@ from typing import IO
 
 import numpy as np
 
+from moonteam import interrupts
 from moonteam.compilation import cores
 from moonteam.report import video
 from sim2grid.show.film import Film
@@ -40,7 +41,7 @@ class Cost:
     frames: int
     seconds: float  # of film
     cpu_s: float
-    wall_s: float
+    wall_s: float  # until it was whole, whenever it was asked for
 
     def timing(self) -> dict[str, float]:
         """As timing.json holds it."""
@@ -58,21 +59,24 @@ class Shooting:
         self.path, self.done = path, 0
         self.num_frames = Film(take, style).num_frames
         self._style = style
-        self._begun = time.perf_counter()
-        self._cpu_s: dict[int, float] = {}
+        self._begun, self._wall_s = time.perf_counter(), 0.0
         self._error: BaseException | None = None
         count = processes or min(cores(), MOST_PROCESSES, self.num_frames)
         self._crew: list[_Drawing] = []
         try:
             for index in range(count):
                 self._crew.append(_Drawing(index, count))
-            for drawing in self._crew:
-                drawing.send(take, style)
         except BaseException:
             self.stop()
             raise
-        self._thread = threading.Thread(target=self._collect, name="film", daemon=True)
+        self._thread = threading.Thread(target=self._collect, args=(take,), name="film",
+                                        daemon=True)
         self._thread.start()
+
+    @property
+    def whole(self) -> bool:
+        """Whether the film is there."""
+        return not self._thread.is_alive() and self._error is None
 
     def wait(self, progress: Callable[[int], None] = lambda done: None) -> Cost:
         """Returns when the film is written whole; `progress(frames so far)` now and then.
@@ -90,8 +94,7 @@ class Shooting:
         if self._error is not None:
             raise self._error
         return Cost(self.num_frames, self.num_frames / self._style.fps,
-                    sum(drawing.cpu_s for drawing in self._crew),
-                    time.perf_counter() - self._begun)
+                    sum(drawing.cpu_s for drawing in self._crew), self._wall_s)
 
     def stop(self) -> None:
         """Ends the processes; nothing is left of a film that was not there yet."""
@@ -107,12 +110,14 @@ class Shooting:
     def __exit__(self, *error: object) -> None:
         self.stop()
 
-    def _collect(self) -> None:
+    def _collect(self, take: Take) -> None:
         width, height = self._style.size
         try:
-            with ExitStack() as stack:
+            with interrupts.leaving(self.stop), ExitStack() as stack:
                 for drawing in self._crew:
                     stack.callback(drawing.kill)
+                for drawing in self._crew:  # which take it once they have begun
+                    drawing.send(take, self._style)
                 add = stack.enter_context(video.writing(
                     self.path, (height, width), self._style.fps, CRF, preset="veryfast"))
                 for number in range(self.num_frames):
@@ -120,6 +125,7 @@ class Shooting:
                     self.done = number + 1
                 for drawing in self._crew:
                     drawing.finish()
+            self._wall_s = time.perf_counter() - self._begun
         except BaseException as error:  # told to whoever waits
             self._error = error
 

@@ -114,10 +114,10 @@ def rollout(mission: Named | Mission, planner: str | None = None, *, out: Named 
     if isinstance(mission, Mission):
         folder = command.folder(mission.name, args.out, args.force)
         with outputs.folder(folder, (*command.FILES, WRITTEN), force=args.force):
-            done = command.carry_out(replace(args, out=folder,
-                                             mission=os.fspath(_write(folder, mission))))
+            [done] = command.carry_out(replace(args, out=folder,
+                                               mission=(os.fspath(_write(folder, mission)),)))
     else:
-        done = command.carry_out(replace(args, mission=os.fspath(mission)))
+        [done] = command.carry_out(replace(args, mission=(os.fspath(mission),)))
     if done.interrupted:
         raise KeyboardInterrupt
     return Rollout(done.report, done.made.execution.record, done.out,

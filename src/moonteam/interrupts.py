@@ -6,6 +6,8 @@ takes no notice of a signal while a compiled program runs or XLA compiles, so a 
 - nothing is done yet that could be lost: half a second later the process leaves, come what may.
 - something is (`hold`): a line is printed at once, and what runs is waited for.
 - a second signal: the process leaves half a second later.
+
+Before it leaves so, what others do for it is ended (`leaving`).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
@@ -48,6 +50,7 @@ class _State:
     saved: str = ""  # what is on the disk by now, in words
     said: bool = False  # that it was interrupted
     stop: Stop | None = None  # who is told instead of interrupted, while something is held
+    endings: list[Callable[[], object]] = field(default_factory=list)  # before it leaves
 
 
 _now = _State()
@@ -56,6 +59,22 @@ _now = _State()
 def hold() -> None:
     """Says that work is done which the end of a command will save: it is waited for from now on."""
     _now.held = True
+
+
+def release() -> None:
+    """Says that all of it is saved: a signal is answered as at the beginning."""
+    _now.held = False
+
+
+@contextmanager
+def leaving(end: Callable[[], object]) -> Iterator[None]:
+    """Inside it `end()` is called, in another thread, if the process leaves in the middle."""
+    endings = _now.endings
+    endings.append(end)
+    try:
+        yield
+    finally:
+        endings.remove(end)
 
 
 def saved(words: str) -> None:
@@ -205,5 +224,15 @@ def _watch(reading: int, state: _State) -> None:
             time.sleep(_GRACE)
             if not state.said:
                 _write(f"interrupted{_and_saved(state)}")
+            _end(state)
             os._exit(CODE)
     os.close(reading)
+
+
+def _end(state: _State) -> None:
+    """Calls what is to be called before the process leaves; waits no longer than a moment."""
+    threads = [threading.Thread(target=end, daemon=True) for end in list(state.endings)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(_GRACE)

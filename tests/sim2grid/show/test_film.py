@@ -67,6 +67,8 @@ def test_the_film_is_drawn_by_other_processes_and_has_its_pictures(short_take, t
     cost = shooting.wait(seen.append)
     assert cost.frames == shooting.num_frames == Film(short_take, SMALL).num_frames
     assert cost.cpu_s > 0
+    assert shooting.whole
+    assert shooting.wait() == cost, "whenever it is asked"
     assert seen[-1] == cost.frames
     assert set(cost.timing()) == {"film_frames", "film_seconds", "film_cpu_s", "film_wall_s"}
     read = subprocess.run(
