@@ -289,8 +289,8 @@ def _in_turn(jobs: list[_Job]) -> Iterator[Done]:
             driven = _drive_and_save(jobs.pop(0), filmed)
             if filmed is not None:
                 if driven.interrupted and not filmed.whole:
-                    print(f"moonteam: {filmed.job.out}: its film was not finished",
-                          file=sys.stderr)
+                    print(f"moonteam: {filmed.job.out}/report.json holds the one before; its film "
+                          "was not finished", file=sys.stderr)
                 else:
                     yield _finish(filmed)
             filmed = None

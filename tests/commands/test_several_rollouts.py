@@ -125,7 +125,7 @@ def test_stopped_the_film_is_left_out_and_both_reports_stay(both, tmp_path, caps
     assert names(out / "m") == names(out / "m-2") == SAVED
     assert json.loads((out / "m" / "report.json").read_text())["success"]
     assert json.loads((out / "m-2" / "report.json").read_text())["cause"] == "interrupted"
-    assert f"{out / 'm'}: its film was not finished" in capsys.readouterr().err
+    assert f"{out / 'm'}/report.json holds the one before; its film" in capsys.readouterr().err
     [film] = films
     assert all(drawing._process.poll() is not None for drawing in film._crew)
 
