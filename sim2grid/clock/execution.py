@@ -229,7 +229,8 @@ class TimedExecution:
         self._due = False
         self.known.settle(self.book.decision)
         moment = self.moment()
-        if lacking := self._hopeless(moment):
+        lacking = self._hopeless(moment)
+        if (lacking or self._cut_off()) and self.roads is not self._charted:
             self.roads = self._charted  # what was learned may be wrong
             moment = self.moment()
             lacking = self._hopeless(moment)
@@ -250,6 +251,18 @@ class TimedExecution:
             if moment.lapses[j] < 0 or not able or not enough(able, j, moment):
                 found.append(j)
         return found
+
+    def _cut_off(self) -> list[int]:
+        """Robots of the team that no way leads home."""
+        return [i for i, goal in enumerate(self.task.homes)
+                if goal is not None and self.known.mask[i] and not self._at_home(i)
+                and not np.isfinite(self.roads.matrix(
+                    self.task.kinds[i], self.asked.frame.on_map(self.known.xy[i])[None],
+                    goal[None])[0, 0])]
+
+    def _at_home(self, robot: int) -> bool:
+        errand = self.errands[robot]
+        return errand.phase == "there" and errand.choice == HOME
 
     def _choose(self, robot: int, choice: int) -> None:
         """Sends a robot on a new errand."""
@@ -420,11 +433,17 @@ class TimedExecution:
         """Ends the mission when everything is done, or its time is."""
         if self.finished:
             return
-        home = all(errand.phase == "there" and errand.choice == HOME
-                   for i, errand in enumerate(self.errands)
-                   if self.known.mask[i] and self.task.homes[i] is not None)
-        if self.solved.all() and home and not self._happenings.bring_targets:
+        away = [i for i, goal in enumerate(self.task.homes)
+                if goal is not None and self.known.mask[i] and not self._at_home(i)]
+        done = self.solved.all() and not self._happenings.bring_targets
+        if done and not away:
             self._end(None, "")
+        elif done and away == self._cut_off():
+            if self.roads is not self._charted:
+                self.ask()  # what was learned may be wrong
+                return
+            names = ", ".join(self.asked.mission.robots[i].name for i in away)
+            self._end("unsolvable", f"no way leads {names} home")
         elif self.book.time >= self.asked.mission.max_seconds - 1e-6:
             left = ", ".join(self.task.names[j] for j in np.flatnonzero(~self.solved))
             self._end("max_seconds", (f"{left} not solved" if left else "not everybody is home")

@@ -126,6 +126,8 @@ class OnGround:
                 there = goal[None]
                 home[i] = ms(pace[i] * travel.matrix(kind, points, there)[:, 0] + settle)
                 home_now[i] = ms(pace[i] * travel.matrix(kind, here, there)[0] + settle)[0]
+                if home_now[i] >= NEVER:  # closed meanwhile: no plan has to lead there
+                    home[i], home_now[i] = 0, 0
         after = np.zeros((count, count), bool)
         for j in range(count):
             after[j, self.after(j)] = True

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from moonteam.planners.seconds.base import NEVER
 from sim2grid.clock import steer
 from sim2grid.clock.roads import OpenGround, Straight
 
@@ -106,6 +107,27 @@ def test_a_mission_that_a_loss_makes_unsolvable_ends_at_once(mission, drive):
     assert "rover (event)" in done.record.detail
 
 
+HOME_CLOSES = {"at_s": 4, "impassable": {"kind": "wheeled", "at": [0, 0]}}
+
+
+def test_who_has_no_way_home_any_more_serves_on_and_then_the_mission_is_over(mission, drive):
+    spec = mission([ROVER | {"home": [0, 0]}], [{"at": [6, 0], "skills": ["A"]}],
+                   events=[HOME_CLOSES])
+    done = drive(spec, (0, (0,)), roads=Shut({"wheeled": 0.5, "legged": 0.4}))
+    assert [solve.target for solve in done.record.solves] == [0]
+    assert done.record.failure == "unsolvable"
+    assert done.record.detail == "no way leads rover home"
+    assert done.record.seconds() == pytest.approx(6 / 0.5, abs=2.0)
+
+
+def test_who_is_at_home_when_it_closes_stays_there(mission, drive):
+    spec = mission([ROVER | {"home": [0, 0]}, WALKER | {"skills": ["A"]}],
+                   [{"at": [6, 0], "skills": ["A"]}], events=[HOME_CLOSES])
+    done = drive(spec, (0, (1,)), roads=Shut({"wheeled": 0.5, "legged": 0.4}))
+    assert done.record.success
+    assert done.planner._planner.asked[-1].start[0].min() >= NEVER
+
+
 def test_events_of_all_sorts_are_noted(mission, drive):
     spec = mission([ROVER], [{"at": [6, 0], "skills": ["A"]}], events=[
         {"at_s": 2, "slow": {"robot": "rover", "factor": 0.5}},
@@ -151,6 +173,24 @@ class Wall(OpenGround):
 
     def close(self, kind, xy):
         return Wall(self.speeds, (*self.closed, (kind, *np.round(xy, 3))))
+
+
+@dataclass(frozen=True)
+class Shut(OpenGround):
+    """Open ground where no way leads to what was closed."""
+
+    closed: tuple = ()
+
+    def matrix(self, kind, starts, to):
+        seconds = super().matrix(kind, starts, to)
+        seconds[:, [not self.passable(kind, at) for at in to]] = np.inf
+        return seconds
+
+    def passable(self, kind, xy):
+        return all(of != kind or np.linalg.norm(at - xy) > 0.5 for of, at in self.closed)
+
+    def close(self, kind, xy):
+        return Shut(self.speeds, (*self.closed, (kind, xy)))
 
 
 @dataclass(frozen=True)
