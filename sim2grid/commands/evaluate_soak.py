@@ -26,7 +26,7 @@ FILES = ("config.json", "rows.jsonl", "report.json", "table.md", "soak.png", FAI
 
 @dataclass(frozen=True)
 class Args(Seeded, Resumable, Reported):
-    """Run random unlike missions in physics, one after the other in one process.
+    """Run random unlike missions in physics, ten at a time in one process.
 
     Grounds (mare, highland) of 8 to 64 m, teams of 1 to 6 robots in every mixture of our kinds,
     1 to 8 targets, events of every kind, in steps (barrier, async) and by the clock, decided by
@@ -100,18 +100,19 @@ def _write(path: Path, mission: Mission) -> None:
     files.write_text(path, yaml.safe_dump(msgspec.to_builtins(mission), sort_keys=False))
 
 
-def again(path: Path, who: Who) -> str:
-    """The command that runs a mission again."""
+def again(path: Path, who: Who, row: int) -> str:
+    """The command that runs a mission again, in the row that it had."""
     from sim2grid.commands import rollout
+    from sim2grid.study.soak import BLOCK
 
     return command.line("rollout", rollout.Args(
         mission=(str(path),), planner=who.planner, policy=who.policy, time_limit=who.time_limit,
-        mode=who.mode, backend="native", seed=who.seed)) + " --no-video"
+        mode=who.mode, backend="native", seed=who.seed, row=(row, BLOCK))) + " --no-video"
 
 
 def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any]:
     from moonteam.report import provenance
-    from sim2grid.study.soak import failures, memory, who_decides
+    from sim2grid.study.soak import BLOCK, failures, memory, who_decides
 
     line = memory(entries)
     wall = sum(entry.wall_s for entry in entries)
@@ -125,7 +126,8 @@ def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any
             "options": command.figures(args), "memory": line, "seconds": seconds,
             "failures": failures(entries), "notes": notes,
             "commands": {entry.number: again(_file(args.out, entry.number),
-                                             who_decides(args.seed, entry.number))
+                                             who_decides(args.seed, entry.number),
+                                             entry.number % BLOCK)
                          for entry in entries if not entry.success},
             "tracebacks": {entry.number: entry.traceback for entry in entries if entry.traceback}}
 

@@ -42,6 +42,7 @@ FILES = ("report.html", "video.mp4", "video.webp", "video.gif", "map.mp4", "map.
          "paths.png", "report.json", "timing.json",
          "config.json")
 """In --out."""
+MOST_ROWS = 1000
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,9 @@ class Args(Filmed, Planning, Forced, Printed):
     """Number of the mission in --from."""
     contender: str | None = None
     """Whose run of it, a name in --from such as "closed exact barrier"; the first by default."""
+    row: tuple[int, int] | None = None
+    """Which row of an engine of how many: floating point may differ between rows. `evaluate soak`
+    says it of its missions. Default: 0 1."""
     out: Aside[Path | None] = None
     """Output folder, of several missions OUT/NAME each; runs/NAME by default, or runs/NAME-2 and so
     on where that holds a rollout."""
@@ -99,7 +103,7 @@ class Args(Filmed, Planning, Forced, Printed):
 
 
 FROM_REPORT = ("planner", "policy", "decode", "objective", "alpha", "beta", "time_limit",
-               "preference", "mode", "backend", "seed")
+               "preference", "mode", "backend", "seed", "row")
 """Options that a report answers for its missions."""
 
 
@@ -117,8 +121,7 @@ class Run:
     seed: int
     title: str  # of the film
     command: str  # that makes it again
-    width: int = 1  # rows of the engine
-    row: int = 0  # the one that is used
+    row: tuple[int, int] = (0, 1)  # of the engine, and how many it has
     before: Report | None = None  # what came of it when it was run first
     trace: Trace | None = None  # of the plan on the grid, None by the clock
     why: str = "as the report has it"  # this engine
@@ -350,6 +353,11 @@ def _check(args: Args) -> None:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
     parse(args.decode)
     filming.check(args)
+    if args.row is not None and not 0 <= args.row[0] < args.row[1] <= MOST_ROWS:
+        raise InputError("--row", f"{args.row[0]} {args.row[1]} is not allowed; a row from 0, and "
+                         f"how many there are, at most {MOST_ROWS}")
+    if args.row is not None and args.backend == "fused":
+        raise InputError("--row", "is for mjx and native")
     if args.mode == "clock" and args.backend == "fused":
         raise InputError("--backend fused", "drives in steps; by the clock mjx or native")
     if args.backend == "fused" and args.viewer:
@@ -401,7 +409,7 @@ def _from_file(args: Args) -> Run:
     return Run(prepared, execution, prepared.scene.qpos0, plan, name,
                None if name == "policy" else args.objective, args.backend or "", args.seed,
                f"{mission.name}: {who}", command.line("rollout", args), trace=trace,
-               why=why, best=lambda: _best(prepared, trace))
+               row=args.row or (0, 1), why=why, best=lambda: _best(prepared, trace))
 
 
 def _with_engine(args: Args) -> tuple[Args, str]:
@@ -434,9 +442,9 @@ def _by_the_clock(args: Args, mission: Mission, why: str) -> Run:
     who = name if name != "policy" else f"policy {Path(args.policy).stem}"
     return Run(prepared, execution, prepared.scene.qpos0, None, name,
                None if name == "policy" else args.objective, args.backend or "", args.seed,
-               f"{mission.name}: {who}, by the clock", command.line("rollout", args), why=why,
-               best=lambda: optimum.in_seconds(name, args.planner_options(args.seed),
-                                               execution.task.first(execution.roads)))
+               f"{mission.name}: {who}, by the clock", command.line("rollout", args),
+               row=args.row or (0, 1), why=why, best=lambda: optimum.in_seconds(
+                   name, args.planner_options(args.seed), execution.task.first(execution.roads)))
 
 
 def _from_report(args: Args) -> Run:
@@ -451,7 +459,7 @@ def _from_report(args: Args) -> Run:
     return Run(staged.prepared, staged.execution, staged.prepared.scene.qpos0, staged.grid_plan,
                row.report.planner, row.report.objective, contender.backend, row.seed,
                f"mission {row.number}, {row.site}: {contender.name}", command_line,
-               staged.width, row.slot, row.report)
+               (row.slot, staged.width), row.report)
 
 
 def _grid_plan(prepared: Prepared, planner: Planner, seed: int) -> tuple[GridPlan, Trace]:
@@ -513,7 +521,8 @@ def _drive(args: Args, made: Run) -> dict[str, float]:
             if show:
                 show(execution)
 
-        run_executions([execution], backend, made.start, look, width=made.width, rows=[made.row])
+        row, width = made.row
+        run_executions([execution], backend, made.start, look, width=width, rows=[row])
     if not looks:
         return {"compile_s": 0.0, "wall_s": time.perf_counter() - begun}
     running = looks[-1] - looks[0]

@@ -1,18 +1,20 @@
-"""Unlike missions one after the other in one process: what fails, and whether memory stays flat.
+"""Unlike missions in one process: what fails, and whether memory stays flat.
 
 Mission `number` and who decides in it follow from (seed, number) alone. BLOCK missions in a row
-share ground and kinds of robots, and so one compiled engine; all else is drawn for each.
+share ground and kinds of robots, and so one engine, in which they run side by side; all else is
+drawn for each.
 
 Legend: R robots, M targets, F missions of a block.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BLOCK = 10
-"""F: missions in a row on the same ground with the same kinds of robots."""
+"""F: missions in a row on the same ground with the same kinds of robots, and the engine's rows."""
 FORGET = 20
 """Blocks after which what JAX traced of ever new teams and grounds is dropped: it would keep the
 last thousands of each kind, half a MiB a mission, and of no use to a team that does not come back.
@@ -110,8 +112,8 @@ class Entry(msgspec.Struct, frozen=True):
     traceback: str | None
     seconds: float | None  # of the mission
     decisions: int | None
-    wall_s: float
-    resident_mib: float  # of the process, afterwards
+    wall_s: float  # its share of what its block took
+    resident_mib: float  # of the process, after the block
     process: int  # number of the mission that its process began with
 
 
@@ -128,24 +130,32 @@ class Stage:
         fleet = self.fleet
         return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds))
 
-    def run(self, index: int, who: Who) -> Report:
-        """Mission `index` of the block to its end."""
+    def run(self, deciders: Mapping[int, Who]) -> dict[int, Report]:
+        """Missions of the block to their ends, side by side: index -> report.
+
+        Each keeps to its row of an engine of F, and so comes to the same with others or without.
+        """
+        fleet = self.fleet
+        executions = [self._execution(index, who) for index, who in deciders.items()]
+        run(executions, self.backend, np.stack([fleet.starts[index] for index in deciders]),
+            width=BLOCK, rows=list(deciders))
+        return {index: make_report(
+            execution.record, fleet.missions[index], fleet.frame, fleet.bases,
+            planner=who.planner, objective=None if who.planner == "policy" else "makespan",
+            mode=who.mode, backend=self.backend_name, seed=who.seed, grid_plan=None,
+            kinds=fleet.kinds, height=ground_height(fleet.site.heights, fleet.site.spacing))
+            for (index, who), execution in zip(deciders.items(), executions, strict=True)}
+
+    def _execution(self, index: int, who: Who) -> Execution | TimedExecution:
         fleet = self.fleet
         mission, scenario = fleet.missions[index], fleet.scenarios[index]
         if who.mode == "clock":
             chooser = Keeper(timed_planners.find(who.planner).make(who.options))
-            execution = TimedExecution(mission, scenario, chooser, fleet.bodies, fleet.frame,
-                                       self.roads, seed=who.seed)
-        else:
-            execution = Execution(mission, scenario,
-                                  registry.make(who.planner, replace(who.options, seed=0)),
-                                  fleet.bodies, fleet.frame, seed=who.seed, mode=who.mode)
-        run([execution], self.backend, fleet.starts[index], width=1)
-        return make_report(
-            execution.record, mission, fleet.frame, fleet.bases, planner=who.planner,
-            objective=None if who.planner == "policy" else "makespan", mode=who.mode,
-            backend=self.backend_name, seed=who.seed, grid_plan=None, kinds=fleet.kinds,
-            height=ground_height(fleet.site.heights, fleet.site.spacing))
+            return TimedExecution(mission, scenario, chooser, fleet.bodies, fleet.frame,
+                                  self.roads, seed=who.seed)
+        return Execution(mission, scenario,
+                         registry.make(who.planner, replace(who.options, seed=0)),
+                         fleet.bodies, fleet.frame, seed=who.seed, mode=who.mode)
 
     @property
     def backend_name(self) -> str:
@@ -155,7 +165,7 @@ class Stage:
 
 @dataclass
 class Soak:
-    """`count` missions, one after the other.
+    """`count` missions, a block after the other.
 
     `keep` is called with each entry and its mission, None where that could not even be drawn.
     """
@@ -170,32 +180,55 @@ class Soak:
         """Runs what is not done yet. An exception ends its mission, not the soak."""
         begun = time.perf_counter()
         todo = [number for number in range(self.count) if number not in self.done]
-        with bar("soak", self.count, self.count - len(todo)) as update:
-            for done, number in enumerate(todo, self.count - len(todo) + 1):
+        done = self.count - len(todo)
+        with bar("soak", self.count, done) as update:
+            for _, numbers in itertools.groupby(todo, key=lambda number: number // BLOCK):
                 if self.seconds is not None and time.perf_counter() - begun > self.seconds:
                     return
-                self._one(number, todo[0])
-                update(done, f"mission {number}")
+                those = list(numbers)
+                self._block(those, todo[0])
+                update(done := done + len(those), f"mission {those[-1]}")
 
-    def _one(self, number: int, first: int) -> None:
-        begun, recipe = time.perf_counter(), block(self.seed, number // BLOCK)
-        who, report, mission, failed, cause = who_decides(self.seed, number), None, None, None, None
+    def _block(self, numbers: list[int], first: int) -> None:
+        """Missions of a block, side by side; after an exception one by one, to see whose it was."""
         try:
-            stage = _stage(self.seed, number // BLOCK)
-            mission = stage.fleet.missions[number % BLOCK]
-            report = stage.run(number % BLOCK, who)
-            cause = None if report.success else cause_of(report)
+            told = self._told(numbers, first)
         except Exception as error:
-            failed = traceback.format_exc()
-            cause = f"exception: {type(error).__name__}: {error}"
-        self.keep(Entry(
+            if len(numbers) > 1:
+                for number in numbers:
+                    self._block([number], first)
+                return
+            told = [self._failed(numbers[0], first, error)]
+        for entry, mission in told:
+            self.keep(entry, mission)
+        interrupts.hold()
+
+    def _told(self, numbers: list[int], first: int) -> list[tuple[Entry, Mission | None]]:
+        begun, stage = time.perf_counter(), _stage(self.seed, numbers[0] // BLOCK)
+        found = stage.run({n % BLOCK: who_decides(self.seed, n) for n in numbers})
+        each = (time.perf_counter() - begun) / len(numbers)
+        return [self._entry(number, first, stage.fleet.missions[number % BLOCK],
+                            None if report.success else cause_of(report), report, wall_s=each)
+                for number, report in zip(numbers, found.values(), strict=True)]
+
+    def _failed(self, number: int, first: int, error: Exception) -> tuple[Entry, Mission | None]:
+        mission = None
+        with contextlib.suppress(Exception):  # where it could not even be drawn
+            mission = _stage(self.seed, number // BLOCK).fleet.missions[number % BLOCK]
+        return self._entry(number, first, mission, f"exception: {type(error).__name__}: {error}",
+                           traceback="".join(traceback.format_exception(error)))
+
+    def _entry(self, number: int, first: int, mission: Mission | None, cause: str | None,
+               report: Report | None = None, traceback: str | None = None, wall_s: float = 0.0
+               ) -> tuple[Entry, Mission | None]:
+        recipe, who = block(self.seed, number // BLOCK), who_decides(self.seed, number)
+        return Entry(
             number, recipe.preset, recipe.site_seed, recipe.side,
             tuple(kind for _, kind in recipe.team), recipe_targets(self.seed, number),
             tuple(what(event) for event in mission.events) if mission else (), who.mode,
-            who.planner, cause is None, cause, failed, report and report.seconds,
-            report and report.decisions, round(time.perf_counter() - begun, 3),
-            round(resident_mb() * 1e6 / 2**20, 1), first), mission)
-        interrupts.hold()
+            who.planner, cause is None, cause, traceback, report and report.seconds,
+            report and report.decisions, round(wall_s, 3),
+            round(resident_mb() * 1e6 / 2**20, 1), first), mission
 
 
 def what(event: Event) -> str:

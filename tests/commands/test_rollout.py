@@ -62,6 +62,7 @@ def test_bad_missions_one_line_code_two_nothing_written(tmp_path, capsys, old, n
     (["--mission", "3"], "give --from REPORT too"),
     (["--contender", "x"], "give --from REPORT too"),
     (["--size", "641", "360"], "both even"),
+    (["--row", "3", "3"], "a row from 0"),
     (["--fps", "0"], "--fps"),
     (["--speed", "-2"], "--speed"),
     (["--camera", "nobody"], "auto, wide, chase, hop, roll"),

@@ -58,8 +58,8 @@ def test_missions_that_failed_end_alike_when_repeated_from_their_files(small, tm
 
 def test_an_exception_is_noted_and_the_soak_goes_on_where_it_was_stopped(
         small, tmp_path, monkeypatch):
-    def run(stage, index, who):
-        if index == 0:
+    def run(stage, deciders):
+        if 0 in deciders:
             raise ZeroDivisionError("once")
         raise KeyboardInterrupt
 
