@@ -233,9 +233,8 @@ class Film:
         put(image, (left, MARGIN * u), self.take.title, round(20 * u))
         bottom = self._target_list(image, moment, (left, 170 * u))
         for i in range(len(self.mission.robots)):
-            y = bottom + (20 + 58 * i) * u
-            if y + 50 * u < self.height:
-                right = min(left + 300 * u, self.width - 4)
+            y, right = bottom + (20 + 58 * i) * u, min(left + 300 * u, self.width - 4)
+            if y + 50 * u < self.height and left + 60 * u < right:  # else no room beside the map
                 self._chip(image, moment, i, (left, y, right, y + 50 * u))
         return image
 

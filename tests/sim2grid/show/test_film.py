@@ -116,6 +116,11 @@ def test_the_cards_say_the_planner_and_the_optimum(short_take):
         assert ("both for what was known at the start" in [line for line, _, _ in lines]) is said
 
 
+def test_a_square_picture_has_room_for_the_map_alone(short_take):
+    film = Film(short_take, Style(size=(160, 160), fps=10, seconds=2.0))
+    assert film.picture(film.num_frames // 2).shape == (160, 160, 3)
+
+
 def test_planned_ways_leave_out_who_stays():
     cells = np.array([[[0, 0], [3, 3]], [[1, 0], [3, 3]], [[1, 0], [3, 2]]])
     first, second = planned_ways(cells, Frame((4, 4), 1.0))
