@@ -28,7 +28,7 @@ from jax import Array
 
 from moonteam.grid import scenarios
 from moonteam.grid.types import Problem
-from moonteam.physics.backends import MjxBackend, WorldState
+from moonteam.physics.backends import MjxBackend, WorldState, in_order
 from moonteam.problem.scenario import Scenario
 from moonteam.trees import where
 from sim2grid.frame import Frame
@@ -111,7 +111,7 @@ class Fused:
         key = (tuple(leaves), treedef)
         if key not in self._programs:
             program = jax.jit(partial(_run, self.setup, self.decider, self.backend.traced))
-            self._programs[key] = program.lower(*arguments).compile()
+            self._programs[key] = program.lower(*arguments).compile(in_order())
         return self._programs[key]
 
 

@@ -14,7 +14,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -193,7 +193,7 @@ class MjxBackend:
         advance = jax.jit(self.traced, static_argnames="num_control_steps")
         self._programs[key] = advance.lower(
             self.model, self.scene.surface, state, commands,
-            num_control_steps=num_control_steps).compile()
+            num_control_steps=num_control_steps).compile(in_order())
         return time.perf_counter() - begun
 
     def _key(self, batch: int, num_control_steps: int) -> tuple[int, int]:
@@ -283,7 +283,7 @@ class NativeBackend:
             # Not a method: the engine would hold itself until the garbage collector comes by.
             jax.vmap(partial(_control_world, scene, self._memory, self._told),
                      in_axes=(None, 0, 0, 0)),
-            compiler_options=_on_one_thread())
+            compiler_options=in_order())
 
     def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
         """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
@@ -339,11 +339,14 @@ class NativeBackend:
         return self._batch
 
 
-def _on_one_thread() -> dict[str, str | bool]:
-    """XLA's options, where it knows them, to run a program on the thread that calls it.
+@cache
+def in_order() -> dict[str, str | bool]:
+    """XLA's options, where it knows them, to run a CPU program's operations one after the other.
 
     A call of the controllers is some hundred operations of a microsecond or less; XLA would
-    hand part of them to other threads, which costs more than the operations.
+    hand part of them to other threads, which costs more than the operations. And LAPACK's batched
+    factorisations, which MJX has, wait for threads of the very pool that they would be handed to:
+    where all of those factorise at once, with two cores soon, they wait for ever.
     """
     options: dict[str, str | bool] = {
         "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
