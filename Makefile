@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-c
 # Needs no more than a user does; small enough to be there in three minutes, installing included.
 demo: $(RUNS)
 	$(BIN)/moonteam rollout outpost --planner policy --policy any_team_mappo --decode best-of-16 \
-	  --size 960 540 --fps 24 --seconds 14 --out runs/demo --force
+	  --size 960 540 --fps 24 --seconds 18 --out runs/demo --force
 	@echo "Watch runs/demo/video.mp4; the report is runs/demo/report.html"
 
 test: $(STAMP)
