@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -180,3 +184,28 @@ def test_mjx_worlds_do_not_share_anything(scene, mjx_backend):
     state, _ = mjx_backend.advance(mjx_backend.reset(batch=2), commands, STEPS)
     moved = np.linalg.norm(np.asarray(state.qpos)[:, :2] - scene.qpos0[:2], axis=1)
     assert moved[0] < 0.02 < moved[1]
+
+
+FACTORISES = """
+import sys
+import jax
+import jax.numpy as jnp
+from moonteam.physics.backends import in_order
+
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+def step(_, a):
+    found = [jnp.linalg.cholesky(a[i]) for i in range(8)]
+    return jnp.stack([one @ one.swapaxes(-1, -2) for one in found])
+
+x = jax.random.normal(jax.random.key(0), (8, 64, 40, 40))
+a = x @ x.swapaxes(-1, -2) + 40 * jnp.eye(40)
+many = jax.jit(lambda a: jax.lax.fori_loop(0, 60, step, a))
+assert bool(jnp.isfinite(many.lower(a).compile(in_order())(a)).all())
+"""
+
+
+def test_batches_that_are_factorised_side_by_side_do_not_wait_for_each_other():
+    """As XLA compiles it by default this never ends on two cores."""
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", FACTORISES], env=environment, timeout=300, check=True)
