@@ -257,16 +257,16 @@ def _connect(ray: Any, on: str, address: tuple[str, int] | None) -> None:
     try:
         ray.init("local" if address is None else on, **quiet)
     except (ConnectionError, ImportError, OSError, RuntimeError, ValueError) as error:
-        raise InputError("--on", _no_token(on) if _TOKEN.search(str(error)) else
-                         f"{on}: {_first_line(error)}") from None
+        if _TOKEN.search(str(error)):
+            raise InputError("--on", f"{on} wants its token: {_BRINGS}") from None
+        # A client is not told that it is its token.
+        perhaps = f"; if it wants its token: {_BRINGS}" if on.startswith("ray://") else ""
+        raise InputError("--on", f"{on}: {_first_line(error)}{perhaps}") from None
 
 
 _TOKEN = re.compile("unauthenticated|auth.?token", re.IGNORECASE)
-
-
-def _no_token(on: str) -> str:
-    return (f"{on} wants its token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to what `ray "
-            "get-auth-token` says where it was started, or have that in ~/.ray/auth_token")
+_BRINGS = ("set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to what `ray get-auth-token` says where it "
+           "was started, or have that in ~/.ray/auth_token")
 
 
 def _check_answer(on: str, address: tuple[str, int]) -> None:
@@ -286,7 +286,7 @@ def _check_answer(on: str, address: tuple[str, int]) -> None:
     except subprocess.TimeoutExpired:
         raise InputError("--on", f"what answers at {on} is no Ray cluster; {start}") from None
     if tried.returncode and _TOKEN.search(tried.stderr):
-        raise InputError("--on", _no_token(on))
+        raise InputError("--on", f"{on} wants its token: {_BRINGS}")
 
 
 def _first_line(error: BaseException) -> str:
