@@ -18,11 +18,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import jax
 import msgspec
 import numpy as np
 
-from moonteam import interrupts
+from moonteam import compilation, interrupts
 from moonteam.physics.backends import make_backend
 from moonteam.physics.trials.speed import resident_mb
 from moonteam.planners import registry
@@ -53,8 +52,8 @@ if TYPE_CHECKING:
 BLOCK = 10
 """F: missions in a row on the same ground with the same kinds of robots, and the engine's rows."""
 FORGET = 20
-"""Blocks after which what JAX traced of ever new teams and grounds is dropped: it would keep the
-last thousands of each kind, half a MiB a mission, and of no use to a team that does not come back.
+"""Blocks after which what JAX traced of ever new teams and grounds is dropped: it takes megabytes a
+mission, and is of no use to a team that does not come back.
 """
 
 SIDES = {8: 0.6, 12: 0.2, 16: 0.1, 24: 0.05, 32: 0.03, 48: 0.01, 64: 0.01}
@@ -279,7 +278,7 @@ def recipe_targets(seed: int, number: int) -> int:
 def _stage(seed: int, index: int) -> Stage:
     """The missions of a block. Raises InputError where its ground allows none."""
     if index % FORGET == 0:
-        jax.clear_caches()
+        compilation.forget()
     recipe = block(seed, index)
     site, passable = ground_of(recipe)
     drawn = [_draw(recipe, number, site, passable)

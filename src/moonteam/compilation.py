@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import os
 import sys
 import threading
@@ -124,6 +125,20 @@ def keep_freed_memory() -> None:
     mallopt(_MMAP_MAX, 0)
     mallopt(_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(_TOP_PAD, 2**28)
+
+
+def forget() -> None:
+    """Drops what JAX holds of programs in this process, and gives freed memory to the system.
+
+    For a process that meets ever new shapes: JAX keeps the last thousands of traces of each kind.
+    """
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
+    if sys.platform.startswith("linux"):
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def enable_cache() -> None:
