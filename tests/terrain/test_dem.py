@@ -133,6 +133,15 @@ def test_holes_and_special_values_inside_the_window(tmp_path):
     assert np.ptp(import_dem(path, Piece(20.0), detail=False).heights) < 5.0
 
 
+def test_a_hole_that_is_a_signalling_nan_is_a_hole(tmp_path):
+    """Found by the fuzzer: NumPy warned of the number, which is none, of another kind."""
+    heights = np.full((20, 20), 5.0, np.float32)
+    heights.view(np.uint32)[9, 9] = 0x7F800001
+    np.save(tmp_path / "h.npy", heights)
+    found = dem.window(tmp_path / "h.npy", Piece(10.0), pixel=1.0)
+    assert np.allclose(found.heights, 5.0)
+
+
 def test_an_isis_cube(tmp_path):
     values = np.full((40, 40), 100, np.int16) + np.arange(40, dtype=np.int16)
     values[20, 18:23] = [-32768, -32767, -32766, -32765, -32764]

@@ -187,7 +187,7 @@ def _array(path: Named, pixel: float | None, scale: float) -> _Model:
     side = _pixel(path, pixel)
 
     def read(rows: slice, columns: slice) -> Heights:
-        return heights[rows, columns].astype(np.float64) * scale
+        return _float64(heights[rows, columns]) * scale
 
     def place(latitudes: Heights, longitudes: Heights) -> tuple[Heights, Heights]:
         raise InputError(path, "says nothing of latitude and longitude; metres or pixels are "
@@ -195,6 +195,11 @@ def _array(path: Named, pixel: float | None, scale: float) -> _Model:
 
     return _Model(path, (int(heights.shape[0]), int(heights.shape[1])),
                   _Grid((side, 0.0), (0.0, -side)), read, scale, place)
+
+
+def _float64(stored: npt.NDArray[Any]) -> Heights:
+    with np.errstate(invalid="ignore"):  # of NaNs some signal
+        return stored.astype(np.float64)
 
 
 def _pixel(path: Named, pixel: float | None) -> float:
@@ -338,7 +343,7 @@ def _values(path: Named, source: Any, band: int, unit: float, rows: slice,
     if source.driver.startswith("ISIS") and stored.dtype.name in _SPECIAL:
         low, high = _SPECIAL[stored.dtype.name]
         known &= (stored >= low) & (stored <= high)
-    raw = stored.astype(np.float64)
+    raw = _float64(stored)
     known &= np.isfinite(raw) & (np.abs(raw) < _HUGE)
     heights = (raw * source.scales[band] + source.offsets[band]) * unit
     return np.where(known, heights, np.nan)
