@@ -133,6 +133,17 @@ def test_holes_and_special_values_inside_the_window(tmp_path):
     assert np.ptp(import_dem(path, Piece(20.0), detail=False).heights) < 5.0
 
 
+def test_a_reference_system_that_cannot_be_parsed_is_one_line(tmp_path, monkeypatch):
+    """Found by the fuzzer; such a file is opened by one GDAL and not by another."""
+    def fail(path):
+        raise rasterio.errors.CRSError("The WKT could not be parsed. OGR Error code 5")
+
+    path = write(tmp_path / "m.tif")
+    monkeypatch.setattr(rasterio, "open", fail)
+    with pytest.raises(InputError, match=r"m\.tif: is not a GeoTIFF.*The WKT could not be parsed"):
+        dem.window(path, Piece(8.0))
+
+
 def test_a_hole_that_is_a_signalling_nan_is_a_hole(tmp_path):
     """Found by the fuzzer: NumPy warned of the number, which is none, of another kind."""
     heights = np.full((20, 20), 5.0, np.float32)

@@ -214,13 +214,13 @@ def _pixel(path: Named, pixel: float | None) -> float:
 def _raster(path: Named, band: int, scale: float | None, pixel: float | None,
             cut: Callable[[_Model], Window]) -> Window:
     import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 
     with warnings.catch_warnings(), rasterio.Env(CPL_VSIL_CURL_ALLOWED_EXTENSIONS="none"):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             source = rasterio.open(path)
-        except RasterioError as error:
+        except (RasterioError, CRSError) as error:
             raise InputError(path, f"is not a GeoTIFF, nor another elevation model, that can be "
                              f"read: {_short(error)}") from None
         with source:
