@@ -47,6 +47,11 @@ class Errand:
         return cls(choice, "going", place, points, pace * np.asarray(way.legs, float), now,
                    pace * float(way.seconds), watched=now, mark=points[0].copy())
 
+    @property
+    def at_home(self) -> bool:
+        """Whether it has come home."""
+        return self.phase == "there" and self.choice == HOME
+
     def drive(self, xy: Floats) -> int:
         """Drops the pieces that are behind a robot at xy [2]; returns how many."""
         if len(self.points) < 3:

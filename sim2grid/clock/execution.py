@@ -230,7 +230,7 @@ class TimedExecution:
         self.known.settle(self.book.decision)
         moment = self.moment()
         lacking = self._hopeless(moment)
-        if (lacking or self._cut_off()) and self.roads is not self._charted:
+        if self.roads is not self._charted and (lacking or self._cut_off()):
             self.roads = self._charted  # what was learned may be wrong
             moment = self.moment()
             lacking = self._hopeless(moment)
@@ -252,17 +252,21 @@ class TimedExecution:
                 found.append(j)
         return found
 
-    def _cut_off(self) -> list[int]:
-        """Robots of the team that no way leads home."""
-        return [i for i, goal in enumerate(self.task.homes)
-                if goal is not None and self.known.mask[i] and not self._at_home(i)
-                and not np.isfinite(self.roads.matrix(
-                    self.task.kinds[i], self.asked.frame.on_map(self.known.xy[i])[None],
-                    goal[None])[0, 0])]
+    def _away(self) -> list[int]:
+        """Robots of the team that have a home and are not there."""
+        return [i for i, errand in enumerate(self.errands) if self.known.mask[i]
+                and self.task.homes[i] is not None and not errand.at_home]
 
-    def _at_home(self, robot: int) -> bool:
-        errand = self.errands[robot]
-        return errand.phase == "there" and errand.choice == HOME
+    def _cut_off(self) -> list[int]:
+        """Those of them that no way leads home."""
+        found = []
+        for i in self._away():
+            goal, here = self.task.homes[i], self.asked.frame.on_map(self.known.xy[i])
+            assert goal is not None
+            if not np.isfinite(self.roads.matrix(
+                    self.task.kinds[i], here[None], goal[None])[0, 0]):
+                found.append(i)
+        return found
 
     def _choose(self, robot: int, choice: int) -> None:
         """Sends a robot on a new errand."""
@@ -433,8 +437,7 @@ class TimedExecution:
         """Ends the mission when everything is done, or its time is."""
         if self.finished:
             return
-        away = [i for i, goal in enumerate(self.task.homes)
-                if goal is not None and self.known.mask[i] and not self._at_home(i)]
+        away = self._away()
         done = self.solved.all() and not self._happenings.bring_targets
         if done and not away:
             self._end(None, "")

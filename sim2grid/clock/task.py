@@ -12,7 +12,7 @@ import numpy as np
 from moonteam.onground import Floats, OnGround
 from moonteam.planners.seconds.base import NEVER, Bools, Moment, enough
 from moonteam.problem.mission import Mission
-from sim2grid.clock.errand import HOME, Errand
+from sim2grid.clock.errand import Errand
 from sim2grid.clock.roads import Roads
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body
@@ -56,8 +56,7 @@ class Task(OnGround):
             if errand.phase == "there" and errand.choice >= 0:
                 moment.start[i, errand.choice] = 0
             goal = self.homes[i]
-            if errand.phase == "there" and errand.choice == HOME and goal is not None and (
-                    not roads.passable(self.kinds[i], goal)):
+            if errand.at_home and goal is not None and not roads.passable(self.kinds[i], goal):
                 moment.start[i] = NEVER  # it could not come back
         return moment
 
