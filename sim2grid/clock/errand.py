@@ -10,11 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from moonteam.planners.seconds.keeper import HOME, WAIT
 from sim2grid.clock.roads import Floats, Way
 from sim2grid.clock.steer import along
-
-WAIT, HOME = -1, -2
-"""Choices beside the number of a target."""
 
 Phase = Literal["free", "going", "there", "serving"]
 

@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.planners.seconds.base import MS, NEVER, Moment, Service, enough
+from moonteam.planners.seconds.keeper import HOME, WAIT
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.clock import steer
-from sim2grid.clock.errand import HOME, WAIT, Errand
+from sim2grid.clock.errand import Errand
 from sim2grid.clock.happenings import Happenings
 from sim2grid.clock.roads import Floats, Roads
 from sim2grid.clock.task import Task

@@ -428,7 +428,7 @@ def _with_engine(args: Args) -> tuple[Args, str]:
 def _by_the_clock(args: Args, mission: Mission, why: str) -> Run:
     """The run of a mission by the clock. Raises InputError for whatever it cannot be."""
     from moonteam.planners.seconds import registry
-    from sim2grid.clock.keeper import Keeper
+    from moonteam.planners.seconds.keeper import Keeper
     from sim2grid.clock.prepare import by_the_clock, execution_of
     from sim2grid.loop.prepare import prepare
     from sim2grid.measure import optimum

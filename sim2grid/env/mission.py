@@ -34,9 +34,9 @@ from moonteam.grid.macro.world import missing
 from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.seconds import registry
 from moonteam.planners.seconds.base import Moment
+from moonteam.planners.seconds.keeper import Keeper
 from moonteam.problem.mission import Mission
 from sim2grid.clock.execution import TimedExecution
-from sim2grid.clock.keeper import Keeper
 from sim2grid.env.session import Session, Stage
 from sim2grid.env.sessions import Seen, Sessions, Sizes
 from sim2grid.measure.metrics import Report, make_report

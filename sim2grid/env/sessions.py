@@ -21,8 +21,8 @@ import numpy.typing as npt
 from jax import Array
 
 from moonteam.grid.macro.types import FAR, MacroProblem, plain
+from moonteam.planners.seconds.keeper import HOME, WAIT
 from moonteam.planners.seconds.macro import problem_of
-from sim2grid.clock.errand import HOME, WAIT
 from sim2grid.env.session import Session, Stage
 
 Int32 = npt.NDArray[np.int32]

@@ -27,10 +27,10 @@ import trimesh
 from moonteam import paths
 from moonteam.physics import look
 from moonteam.physics.render import SHOWN_GROUPS
+from moonteam.planners.seconds.keeper import HOME, WAIT
 from moonteam.problem.scenario import ACTIONS
 from moonteam.robots.base import RobotKind
 from moonteam.terrain.site import Site
-from sim2grid.clock.errand import HOME, WAIT
 from sim2grid.loop.prepare import Prepared
 from sim2grid.loop.record import SETTING_OUT, Leg
 from sim2grid.measure.slip import ground_height, slip

@@ -37,13 +37,13 @@ from moonteam.planners.base import Objective, Planner
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.base import MS
+from moonteam.planners.seconds.keeper import Keeper
 from moonteam.policies.brain import PointerBrain
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
 from moonteam.robots import team
 from moonteam.terrain.travel import Roads
 from sim2grid.clock.execution import TimedExecution
-from sim2grid.clock.keeper import Keeper
 from sim2grid.clock.prepare import by_the_clock
 from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.drive import Backend, run

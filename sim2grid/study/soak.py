@@ -29,6 +29,7 @@ from moonteam.planners.base import Snapshot
 from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.search.travel import UNREACHABLE, travel_times
 from moonteam.planners.seconds import registry as timed_planners
+from moonteam.planners.seconds.keeper import Keeper
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import Event, Mission, Robot, Silent, Target
 from moonteam.problem.scenario import Scenario
@@ -36,7 +37,6 @@ from moonteam.report.progress import bar
 from moonteam.robots import KINDS, OWN, team
 from moonteam.terrain.travel import Roads
 from sim2grid.clock.execution import TimedExecution
-from sim2grid.clock.keeper import Keeper
 from sim2grid.loop.asked import Mode
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution

@@ -32,6 +32,8 @@ COMMANDS = {
         "moonteam.commands.evaluate_sets", "one policy over all bundled sets, one row a set"),
     "evaluate replanning": (
         "moonteam.commands.evaluate_replanning", "5 + 5 targets, new ones while under way"),
+    "evaluate unfolding": (
+        "moonteam.commands.evaluate_unfolding", "missions in which not everything is known"),
     "evaluate peers": (
         "moonteam.commands.evaluate_peers", "our planners beside what others published"),
     "evaluate timing": ("moonteam.commands.evaluate_timing", "planning time against size"),

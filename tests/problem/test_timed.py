@@ -128,3 +128,52 @@ def test_steps_know_cells_only(tmp_path):
         ", after: [core], appears: 10, lapses: 90", "")
     with pytest.raises(InputError, match=r"robots\[0\].start: \[0.25, 0\] is no cell"):
         read(tmp_path, text)
+
+
+UNFOLDS = {
+    "clock": "seconds", "max_seconds": 100,
+    "agents": [{"at": [0, 0], "skills": ["eye"], "sensor": 3, "pace": [1.2, 1, 0.9]},
+               {"at": [4, 0], "skills": ["eye", "drill"], "lost": 20}],
+    "targets": [{"at": [1, 2], "skills": ["eye"]},
+                {"at": [3, 3], "skills": ["drill"], "hidden": True},
+                {"at": [0, 9], "skills": ["eye"], "following": 1}],
+    "expects": {"more": 2, "area": [0, 0, 9, 9], "loss": {"share": 0.5, "until": 30}}}
+
+
+def test_what_unfolds_is_read_and_survives_a_round_trip():
+    found = timed.convert(UNFOLDS, "one")
+    assert found.unfolds
+    assert not timed.convert(GOOD, "good").unfolds
+    assert timed.convert(msgspec.to_builtins(found), "again") == found
+
+
+@pytest.mark.parametrize(("path", "value", "says"), [
+    (("agents", 0, "sensor"), 0, "agents[0].sensor: 0 is not allowed; above 0"),
+    (("agents", 0, "sensor"), None, "targets[1].hidden: no agent has a sensor"),
+    (("agents", 1, "lost"), -1, "agents[1].lost: -1 is not allowed; seconds, at least 0"),
+    (("agents", 0, "pace"), [1, 1], "agents[0].pace: has 2 numbers; one for each of the 3"),
+    (("agents", 0, "pace"), [1, 0, 1], "agents[0].pace: 0 is not allowed; 0.01 to 100"),
+    (("targets", 2, "following"), -1, "targets[2].following: -1 is not allowed"),
+    (("targets", 2, "appears"), 5, "targets[2].following: 1 is not allowed; a number of targets"),
+    (("targets", 2, "following"), 3, "targets: one follows on 3 others, and only 2 can be solved"),
+    (("targets", 0, "after"), [1], "targets[0].after: it comes after a target that is hidden"),
+    (("targets", 1, "at"), [10, 3], "targets[1].at: [10.0, 3.0] is hidden and outside"),
+    (("expects", "area"), None, "targets[1].hidden: where to look is not said; give expects.area"),
+    (("expects", "area"), [5, 0, 4, 9], "expects.area: [5.0, 0.0, 4.0, 9.0] is not allowed; west"),
+    (("expects", "area"), [0, 0, 1e9, 9], "expects.area"),
+    (("expects", "more"), -1, "expects.more: -1 is not allowed; 0 to"),
+    (("expects", "every"), 0, "expects.every: 0 is not allowed; above 0"),
+    (("expects", "scatter"), 3, "expects.scatter: 3 is not allowed; 0 to 2"),
+    (("expects", "loss"), {"share": 2, "until": 30}, "expects.loss: 2 by 30 s is not allowed"),
+    (("expects", "luck"), 1, "luck"),
+])
+def test_what_cannot_unfold_is_one_line_that_names_it(path, value, says):
+    made = json.loads(json.dumps(UNFOLDS))
+    *way, last = path
+    part = made
+    for key in way:
+        part = part[key]
+    part[last] = value
+    with pytest.raises(InputError) as error:
+        timed.convert(made, "one")
+    assert says in str(error.value)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from moonteam import files, outputs
-from moonteam.commands import testsets_seconds
+from moonteam.commands import testsets_seconds, testsets_unfolding
 from moonteam.commands.options import Forced, Printed
 from moonteam.errors import InputError, not_one_of
 from moonteam.problem import timed
@@ -54,7 +54,7 @@ RECIPES = (
     Recipe(5, 20, 100, certified=False), Recipe(8, 40, 100, certified=False),
 )
 NAMES = tuple(recipe.name() for recipe in RECIPES)
-ALL = NAMES + testsets_seconds.NAMES
+ALL = NAMES + testsets_seconds.NAMES + testsets_unfolding.NAMES
 INDEX = "index.json"
 
 
@@ -68,7 +68,8 @@ class Args(Forced, Printed):
     with --iterations, from several starts) and lower bounds.
 
     The sets in the folder seconds are by the clock: robots of unlike speeds on straight ways,
-    with the least makespan in seconds.
+    with the least makespan in seconds. Those in the folder unfolding are missions in which not
+    everything is known from the start, with all that will happen written down.
 
     Examples:
       moonteam testsets --out assets/testsets --seed 0
@@ -181,7 +182,7 @@ def _make_all(args: Args) -> dict[str, Any]:
     """Makes the sets; the index of the folder, with those that were there before."""
     index_path = args.out / INDEX
     index = files.read_json(index_path, dict[str, Any]) if index_path.exists() else {}
-    for recipe in (*RECIPES, *testsets_seconds.RECIPES):
+    for recipe in (*RECIPES, *testsets_seconds.RECIPES, *testsets_unfolding.RECIPES):
         name = recipe.name()
         if name not in args.sets:
             continue
@@ -193,7 +194,7 @@ def _make_all(args: Args) -> dict[str, Any]:
     return index
 
 
-def make_one(recipe: Recipe | testsets_seconds.Recipe, args: Args,
+def make_one(recipe: Recipe | testsets_seconds.Recipe | testsets_unfolding.Recipe, args: Args,
              update: Callable[[int, str], None]) -> dict:
     """Makes and writes one set; what the index says about it."""
     path = args.out / f"{recipe.name()}.jsonl"
@@ -201,10 +202,11 @@ def make_one(recipe: Recipe | testsets_seconds.Recipe, args: Args,
         scenarios = make(recipe, args, update)
         save_set(path, scenarios)
         return describe(recipe, args, scenarios)
-    problems = testsets_seconds.make(recipe, args.count or recipe.count, args.seed, args.speeds,
-                                     update)
+    module: Any = (testsets_seconds if isinstance(recipe, testsets_seconds.Recipe)
+                   else testsets_unfolding)
+    problems = module.make(recipe, args.count or recipe.count, args.seed, args.speeds, update)
     timed.save_set(path, problems)
-    return testsets_seconds.describe(recipe, args.seed, args.speeds, problems)
+    return module.describe(recipe, args.seed, args.speeds, problems)
 
 
 def describe(recipe: Recipe, args: Args, scenarios: list[Scenario]) -> dict:

@@ -5,6 +5,11 @@ the lattice, a speed and a home for each agent; for each target a service time, 
 skill and number, targets that come before it, a time at which it appears and one after which it
 lapses. Everything but places and skills may be left out, and then is the paper's case.
 
+A problem may unfold: targets that are hidden or arrive, robots that are lost, ways that take
+longer than anybody knew. All that will happen stands in the file, so that whoever decides meets the
+same future; nobody is told before it happens (`moonteam.planners.unfolding`), but a planner that is
+given the whole problem at once plans in hindsight.
+
 Seconds stand for the file's own unit of time, metres for its unit of length, where it comes from
 others (`source` says so).
 """
@@ -35,6 +40,9 @@ Place = tuple[float, float]
 Metric = Literal["straight", "manhattan"]
 Coalition = Annotated[dict[Name, int], msgspec.Meta(max_length=8 * MAX_SKILLS)]
 
+MOST_SIDE = 1024
+"""m of the area in which targets may be hidden."""
+
 MOST_SECONDS = 1e9
 """Of a way, a service or a limit: planners count milliseconds, and a thousand of these add up."""
 
@@ -47,6 +55,12 @@ class Agent(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     speed: float = 1.0
     home: Place | None = None
     kind: str | None = None
+    sensor: float | None = None
+    """m within which it sees hidden targets; None: it sees none."""
+    lost: float | None = None
+    """s at which it is lost, which nobody knows before."""
+    pace: Annotated[tuple[float, ...], msgspec.Meta(max_length=MOST_TARGETS)] = ()
+    """For each target, how many times what is expected its ways there take; unknown before."""
 
 
 class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -69,6 +83,10 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     """s before which no service starts; where a mission unfolds, nobody knows of it before."""
     lapses: float | None = None
     """s after which no service starts."""
+    hidden: bool = False
+    """Nobody knows of it before an agent with a sensor has been near enough."""
+    following: int = 0
+    """Nobody knows of it, and it cannot be served, before so many others are solved."""
 
     def needs(self) -> dict[str, int]:
         """Agents needed of each skill; of an OR target one of each, any of which will do."""
@@ -81,6 +99,27 @@ class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     makespan: float | None = None
     bound: float | None = None
     published: dict[str, float] = {}
+
+
+class Loss(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """In a share of missions one robot, any of them, is lost, at any time up to `until` s."""
+
+    share: float
+    until: float
+
+
+class Prospect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What everybody may expect, from the start, of what nobody knows yet."""
+
+    more: int = 0
+    """Targets that are still to be known of."""
+    every: float | None = None
+    """Mean s between arrivals, by the clock; None where they follow on others or are hidden."""
+    area: tuple[float, float, float, float] | None = None
+    """West, south, east and north, m: where targets can be."""
+    loss: Loss | None = None
+    scatter: float = 0.0
+    """Standard deviation of the logarithm of what ways take over what is expected."""
 
 
 class Timed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -98,6 +137,14 @@ class Timed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     optimal: Known | None = None
     source: str = ""
     """Where it comes from, with its licence."""
+    expects: Prospect | None = None
+    """Where the mission unfolds."""
+
+    @property
+    def unfolds(self) -> bool:
+        """Whether it says anything that only a mission which unfolds asks."""
+        return any(a.lost is not None or a.pace or a.sensor for a in self.agents) or any(
+            t.hidden or t.following for t in self.targets)
 
     @property
     def skill_names(self) -> tuple[str, ...]:
@@ -144,6 +191,8 @@ def check(timed: Timed, source: object, where: str = "") -> Timed:
         raise fail(f"targets[{j}].after", "it would come before itself: a circle of targets that "
                    "wait for each other")
     _check_windows(timed, fail)
+    if timed.unfolds or timed.expects is not None:
+        _check_unfolding(timed, fail)
     return timed
 
 
@@ -321,6 +370,76 @@ def _soonest(timed: Timed, target: Target, who: dict[str, list[int]]) -> float:
              if len(found := arrivals[skill]) >= number]
     either = not target.coalition and target.type == "OR"
     return max(target.appears, min(times) if either else max(times))
+
+
+def _check_unfolding(timed: Timed, fail: Any) -> None:
+    """What nobody knows beforehand has to be possible, and what is expected has to be said."""
+    for i, agent in enumerate(timed.agents):
+        say = lambda key, problem, i=i: fail(f"agents[{i}].{key}", problem)
+        if agent.sensor is not None:
+            _positive(agent.sensor, lambda p, say=say: say("sensor", p))
+        if agent.lost is not None and not 0 <= agent.lost <= MOST_SECONDS:
+            raise say("lost", f"{agent.lost:g} is not allowed; seconds, at least 0, at most "
+                      f"{MOST_SECONDS:g}")
+        if agent.pace and len(agent.pace) != len(timed.targets):
+            raise say("pace", f"has {len(agent.pace)} numbers; one for each of the "
+                      f"{len(timed.targets)} targets is needed")
+        for value in agent.pace:
+            if not 0.01 <= value <= 100:
+                raise say("pace", f"{value:g} is not allowed; 0.01 to 100")
+    _check_expects(timed, fail)
+    known = [not t.hidden and not t.following for t in timed.targets]
+    for j, target in enumerate(timed.targets):
+        say = lambda key, problem, j=j: fail(f"targets[{j}].{key}", problem)
+        if target.following < 0 or (target.following and (target.hidden or target.appears)):
+            raise say("following", f"{target.following} is not allowed; a number of targets, and "
+                      "neither hidden nor appears beside it")
+        if not all(known[k] for k in target.after):
+            raise say("after", "it comes after a target that is hidden or follows on others")
+        if target.hidden:
+            _check_hidden(timed, target, say)
+    counts = sorted(target.following for target in timed.targets)
+    for solved, following in enumerate(counts):
+        if following > solved:
+            raise fail("targets", f"one follows on {following} others, and only {solved} can be "
+                       "solved before it")
+
+
+def _check_expects(timed: Timed, fail: Any) -> None:
+    """Raises for expectations that cannot be."""
+    expects = timed.expects
+    if expects is None:
+        return
+    if not 0 <= expects.more <= MOST_TARGETS:
+        raise fail("expects.more", f"{expects.more} is not allowed; 0 to {MOST_TARGETS}")
+    if expects.every is not None and not 0 < expects.every <= MOST_SECONDS:
+        raise fail("expects.every", f"{expects.every:g} is not allowed; above 0, at most "
+                   f"{MOST_SECONDS:g}")
+    if expects.area is not None:
+        west, south, east, north = expects.area
+        if not (all(map(math.isfinite, expects.area)) and 0 <= east - west <= MOST_SIDE
+                and 0 <= north - south <= MOST_SIDE):
+            raise fail("expects.area", f"{list(expects.area)} is not allowed; west, south, east "
+                       f"and north, at most {MOST_SIDE} m apart")
+    if not 0 <= expects.scatter <= 2:
+        raise fail("expects.scatter", f"{expects.scatter:g} is not allowed; 0 to 2")
+    loss = expects.loss
+    if loss is not None and not (0 <= loss.share <= 1 and 0 < loss.until <= MOST_SECONDS):
+        raise fail("expects.loss", f"{loss.share:g} by {loss.until:g} s is not allowed; a share "
+                   f"of 0 to 1, and seconds above 0, at most {MOST_SECONDS:g}")
+
+
+def _check_hidden(timed: Timed, target: Target, fail: Any) -> None:
+    """Raises for a hidden target that nobody can find."""
+    if all(agent.sensor is None for agent in timed.agents):
+        raise fail("hidden", "no agent has a sensor; give at least one agents[i].sensor in m")
+    area = None if timed.expects is None else timed.expects.area
+    if area is None:
+        raise fail("hidden", "where to look is not said; give expects.area: west, south, east, "
+                   "north in m")
+    west, south, east, north = area
+    if not (west <= target.at[0] <= east and south <= target.at[1] <= north):
+        raise fail("at", f"{list(target.at)} is hidden and outside expects.area, {list(area)}")
 
 
 def _finite(place: Place, fail: Any) -> None:

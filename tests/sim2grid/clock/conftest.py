@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from moonteam.planners.seconds.base import TimedPlan, effort, makespan, timed_again
+from moonteam.planners.seconds.keeper import Keeper
 from moonteam.problem import mission as missions
 from sim2grid.clock.execution import TimedExecution
-from sim2grid.clock.keeper import Keeper
 from sim2grid.clock.roads import OpenGround
 from sim2grid.frame import Frame
 from sim2grid.loop.asked import Body

@@ -1,4 +1,4 @@
-"""From a planner of whole missions to choices: a plan is kept until another is better by enough.
+"""From a planner by the clock to choices: a plan is kept until another is better by enough.
 
 Robots that have set out may be sent elsewhere at any event, so the plan must not flutter: what is
 left of the old one is timed again from where everybody really is, and a new plan has to beat it.
@@ -19,7 +19,9 @@ from moonteam.planners.seconds.base import (
     makespan,
     timed_again,
 )
-from sim2grid.clock.errand import HOME, WAIT
+
+WAIT, HOME = -1, -2
+"""Choices beside the number of a target."""
 
 MARGIN_MS = 1500
 """ms that a new plan has to gain: less is noise of where robots happen to be."""

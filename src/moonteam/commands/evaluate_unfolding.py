@@ -1,0 +1,94 @@
+"""`moonteam evaluate unfolding`: who decides best where not everything is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from moonteam import compilation
+from moonteam.commands.evaluate_grid import deliver, load_any, options_of
+from moonteam.commands.options import Limited, Many, Reported, Resumable, Seeded
+from moonteam.errors import InputError
+from moonteam.problem.timed import Timed
+
+FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", "table.md",
+         "unfolding.png")
+"""In --out."""
+Search = Literal["nearest", "sweep"]
+
+
+@dataclass(frozen=True)
+class Args(Seeded, Limited, Resumable, Reported):
+    """Missions that unfold, played by planners that are told only what is known.
+
+    Targets arrive as others are solved or by a clock, are hidden until a robot with eyes is near,
+    or a robot is lost on the way. All that will happen stands in the set, so that every row meets
+    the same future. A planner plans anew at every event, and looks no further; over K futures it
+    draws as many of what may still happen, tries several first moves in each, and takes the best.
+    Rows are compared with the first, mission by mission. Beside them stands the least makespan in
+    hindsight. Options marked "again" may be given several times.
+
+    Where targets are hidden, robots that have nothing else to do look for them: nearest, to the
+    nearest ground not seen yet, or sweep, up and down a strip each.
+
+    Files in --out: report.json, summary.csv, rows.csv, table.md and unfolding.png; and rows.jsonl,
+    to which each mission is added as it is played (a policy's as a whole), so that --resume goes
+    on.
+
+    Examples:
+      moonteam evaluate unfolding unfolding/following --planner exact --planner greedy
+      moonteam evaluate unfolding unfolding/arrivals --futures 16 --limit 100
+      moonteam evaluate unfolding unfolding/hidden --search nearest --search sweep
+      moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team_mappo
+    """
+
+    set: tyro.conf.Positional[str] = "unfolding/following"
+    """A set by the clock (.jsonl), or the name of a bundled one."""
+    planner: Many[tuple[str, ...]] = ()
+    """By the clock: auto, exact, greedy, lns, policy, another package's, or FILE.py:OBJECT; again
+    for more rows. Default: exact."""
+    futures: Many[tuple[int, ...]] = ()
+    """Also over so many sampled futures; again for more rows. Not for policies."""
+    search: Many[tuple[Search, ...]] = ()
+    """Where targets are hidden: nearest or sweep; again for more rows. Default: both."""
+    policy: Many[tuple[str, ...]] = ()
+    """Policy file (.safetensors) or the name of a bundled policy, for --planner policy; again for
+    more."""
+    decode: Many[tuple[str, ...]] = ()
+    """argmax, sample or best-of-K such as best-of-16; again for more rows. Default: argmax."""
+    time_limit: Many[tuple[float, ...]] = ()
+    """Seconds a plan that anytime planners (exact, lns, auto) may take; again for more rows.
+    Default: theirs."""
+
+
+def _missions(args: Args) -> list[Timed]:
+    """Those of the set. Raises InputError."""
+    found = [one for one in load_any(args.set, args.limit) if isinstance(one, Timed)]
+    if not found:
+        raise InputError(args.set, "is in steps; a set by the clock is needed, such as "
+                         "unfolding/following")
+    hidden = any(target.hidden for one in found for target in one.targets)
+    if args.search and not hidden:
+        raise InputError("--search", "has no effect where no target is hidden")
+    return found
+
+
+def run(args: Args) -> int:
+    """Plays, compares, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
+    compilation.enable_cache()
+    from moonteam.evaluation import timed, unfolding
+    from moonteam.report import command, journal
+
+    found = _missions(args)
+    hidden = any(target.hidden for one in found for target in one.targets)
+    patterns = args.search or tuple(unfolding.PATTERNS) if hidden else ()
+    options = replace(options_of(args), planners=args.planner or ("exact",))
+    rows = unfolding.rows_of(timed.contenders(options), args.futures, patterns)
+    kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
+    title = f"{Path(args.set).stem}: {len(found)} missions that unfold"
+    document = unfolding.evaluate(found, rows, args.seed, title,
+                                  command.line("evaluate unfolding", args), kept)
+    return deliver(args, document, unfolding, "unfolding.png")

@@ -1,0 +1,54 @@
+"""The test sets of missions that unfold, with everything that will happen written down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+
+import msgspec
+
+from moonteam.problem.timed import Timed
+
+COUNT = 1000
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One set: a family of `moonteam.planners.unfolding.draw`."""
+
+    family: str
+    count: int = COUNT
+
+    def name(self) -> str:
+        """File name without suffix, e.g. unfolding/hidden."""
+        return f"unfolding/{self.family}"
+
+
+RECIPES = tuple(Recipe(family) for family in ("following", "arrivals", "hidden", "losses"))
+NAMES = tuple(recipe.name() for recipe in RECIPES)
+
+
+def make(recipe: Recipe, count: int, seed: int, speeds: tuple[float, ...],
+         update: Callable[[int, str], None]) -> list[Timed]:
+    """One set; `update(done, words)` is told about progress."""
+    from moonteam.planners.unfolding import draw
+
+    found = []
+    for one in islice(draw.draws(recipe.family, seed, speeds), count):
+        found.append(msgspec.structs.replace(one, id=f"{recipe.name()}-{len(found):04d}"))
+        if len(found) % 20 == 0 or len(found) == count:
+            update(len(found), f"{len(found)} of {count}")
+    return found
+
+
+def describe(recipe: Recipe, seed: int, speeds: tuple[float, ...], problems: list[Timed]) -> dict:
+    """What index.json says about a set."""
+    bounds = [one.optimal.bound for one in problems
+              if one.optimal is not None and one.optimal.bound is not None]
+    return {"agents": len(problems[0].agents), "targets": len(problems[0].targets), "skills": 2,
+            "size": [32, 32], "clock": "seconds", "metric": problems[0].metric,
+            "speeds": [1.0] if recipe.family == "following" else list(speeds),
+            "count": len(problems), "seed": seed, "unfolds": recipe.family,
+            "optima": "exact in hindsight, a bound",
+            "mean_bound_makespan": round(sum(bounds) / len(bounds), 3)}

@@ -1,0 +1,220 @@
+"""Who decides best where not everything is known: missions that unfold, side by side.
+
+Every row meets the same futures, which stand in the set. Rows are compared with the first, exact
+replanning where it is among them, mission by mission.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from moonteam.errors import InputError
+from moonteam.evaluation import timed as by_clock
+from moonteam.planners.seconds.base import TimedPlanner
+from moonteam.planners.unfolding.deciders import Decider, OverFutures, Replanning, play_together
+from moonteam.planners.unfolding.search import NearestUnseen, Pattern, Sweep
+from moonteam.planners.unfolding.state import Outcome
+from moonteam.planners.unfolding.world import World
+from moonteam.problem.timed import Timed
+from moonteam.report import provenance, tables
+from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure, share
+from moonteam.report.journal import NOTHING, Kept
+from moonteam.report.progress import track
+from moonteam.report.tables import Column
+
+PATTERNS: dict[str, Callable[[], Pattern]] = {"nearest": NearestUnseen, "sweep": Sweep}
+PANELS = (("gap", "seconds over the first row, %", 100.0),
+          ("waited_gap", "waiting over the first row, %", 100.0),
+          ("success", "success", 1.0))
+COLUMNS = (
+    Column("success", "success", lambda value: f"{value:.3f}"),
+    Column("seconds", "mean seconds", lambda value: f"{value:.2f}"),
+    Column("gap", "over the first row", lambda value: f"{100 * value:+.2f} %"),
+    Column("bound_gap", "over hindsight", lambda value: f"{100 * value:+.1f} %"),
+    Column("waited", "a target waits, s", lambda value: f"{value:.2f}"),
+    Column("waited_gap", "waiting over the first row", lambda value: f"{100 * value:+.2f} %"),
+    Column("effort", "s under way", lambda value: f"{value:.1f}"),
+    Column("decisions", "decisions", lambda value: f"{value:.1f}"),
+    Column("decision_seconds", "a decision takes", tables.duration))
+PAGE = COLUMNS
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table."""
+
+    name: str
+    planner: TimedPlanner
+    futures: int = 0
+    pattern: str = ""
+    together: bool = False
+    """Its planner plans many moments in one call, and is followed as it says last."""
+
+    def decider(self, number: int, seed: int) -> Decider:
+        """Who decides in mission `number`."""
+        pattern = PATTERNS[self.pattern]() if self.pattern else None
+        if self.futures:
+            return OverFutures(self.planner, self.futures, seed * 1_000_003 + number, pattern)
+        return Replanning(self.planner, pattern, faithful=not self.together)
+
+    def play(self, problem: Timed, number: int, seed: int) -> Played:
+        """One mission."""
+        world, decider = World(problem), self.decider(number, seed)
+        began = time.perf_counter()
+        while not world.over:
+            world.step(decider.act(world.view()))
+        return Played.of(problem, world.outcome, time.perf_counter() - began)
+
+    def play_all(self, problems: Sequence[Timed]) -> list[Played]:
+        """All missions, side by side."""
+        worlds = [World(problem) for problem in problems]
+        deciders = [Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None,
+                               faithful=False) for _ in problems]
+        began = time.perf_counter()
+        play_together(worlds, self.planner, deciders)
+        each = (time.perf_counter() - began) / max(len(problems), 1)
+        return [Played.of(problem, world.outcome, each)
+                for problem, world in zip(problems, worlds, strict=True)]
+
+
+@dataclass(frozen=True)
+class Played:
+    """A mission as one row played it."""
+
+    id: str
+    success: bool
+    reason: str
+    seconds: float  # failures count with the limit
+    solved: int
+    waited: float
+    effort: float
+    decisions: int
+    lost: int
+    took: float  # s of the machine
+    seen: list[tuple[float, float]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, problem: Timed, out: Outcome, took: float) -> Played:
+        """From what came of it."""
+        limit = problem.max_seconds if problem.max_seconds is not None else out.seconds
+        return cls(problem.id, out.success, out.reason, out.seconds if out.success else limit,
+                   out.solved, out.waited, out.effort, out.decisions, out.lost, took, out.seen)
+
+
+def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
+            patterns: Sequence[str]) -> list[Row]:
+    """Every planner alone, then over so many futures, by every pattern of search.
+
+    Raises InputError for a number of futures that is none.
+    """
+    for count in futures:
+        if not 2 <= count <= 4096:
+            raise InputError("--futures", f"{count} is not allowed; 2 to 4096")
+    found = []
+    for one in contenders:
+        together = callable(getattr(one.planner, "plans", None))
+        for pattern in patterns or [""]:
+            after = f", {pattern}" if pattern else ""
+            found.append(Row(f"{one.name}{after}", one.planner, 0, pattern, together))
+            found += [Row(f"{one.name} over {count} futures{after}", one.planner, count, pattern)
+                      for count in futures if not together]
+    return found
+
+
+def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: str, command: str,
+             kept: Kept = NOTHING) -> dict:
+    """The report; interrupted, of the rows that are done. Raises InputError, nothing run yet."""
+    _check(problems, rows)
+    found: list[tuple[Row, list[Played]]] = []
+    try:
+        for row in rows:
+            found.append((row, _played(problems, row, seed, kept.within(row.name))))
+    except KeyboardInterrupt:
+        if not found:
+            raise
+    bootstrap = Bootstrap(len(problems), seed)
+    bound = np.array([np.nan if p.optimal is None or p.optimal.bound is None else p.optimal.bound
+                      for p in problems])
+    first = found[0][1]
+    notes = [f"Mission by mission against the first row, {found[0][0].name}, in the same futures. "
+             "Missions that fail count with their limit.",
+             f"In brackets: 95 % intervals over {len(problems)} missions: of success by Wilson, "
+             f"else bootstrap, {RESAMPLES} resamples.",
+             "Hindsight: the least makespan if all had been known from the start and nobody were "
+             "lost; nobody can be faster.",
+             "A target waits from when there is one until its service starts; hidden ones from the "
+             "mission's start.", *_causes(found)]
+    lacking = [row.name for row in rows[len(found):]]
+    return {"title": title, "summary": [summary(row, played, first, bound, bootstrap)
+                                        for row, played in found],
+            "rows": [_row(row, one, p) for row, played in found
+                     for one, p in zip(played, problems, strict=True)],
+            "notes": notes, "meta": provenance.meta(command, seed)} | (
+        {"interrupted": lacking} if lacking else {})
+
+
+def summary(row: Row, played: Sequence[Played], first: Sequence[Played], bound: np.ndarray,
+            bootstrap: Bootstrap) -> dict:
+    """A row of the report."""
+    def column(key: str, of: Sequence[Played] = played) -> np.ndarray:
+        return np.array([float(getattr(one, key)) for one in of])
+
+    def over(key: str) -> Figure:
+        return bootstrap.ratio(column(key) - column(key, first), column(key, first))
+
+    found = {"success": share(column("success")), "seconds": bootstrap.mean(column("seconds")),
+             "gap": over("seconds"),
+             "bound_gap": Figure(*(v - 1 for v in bootstrap.ratio(column("seconds"), bound))),
+             "waited": bootstrap.mean(column("waited")), "waited_gap": over("waited"),
+             "effort": bootstrap.mean(column("effort")),
+             "decisions": bootstrap.mean(column("decisions"))}
+    return {"planner": row.name, "missions": len(played),
+            **{key: figure.value for key, figure in found.items()},
+            "intervals": {key: [figure.low, figure.high] for key, figure in found.items()},
+            "decision_seconds": column("took").sum() / max(column("decisions").sum(), 1.0)}
+
+
+def _played(problems: Sequence[Timed], row: Row, seed: int, kept: Kept) -> list[Played]:
+    if row.together:
+        return kept.once(("all",), list[Played], lambda: row.play_all(problems))
+    return [kept.once((str(i),), Played, lambda i=i: row.play(problems[i], i, seed))
+            for i in track(range(len(problems)), row.name, len(problems))]
+
+
+def _check(problems: Sequence[Timed], rows: Sequence[Row]) -> None:
+    """Raises InputError for a planner that does not take so many targets."""
+    largest = max(problems, key=lambda problem: len(problem.targets))
+    for row in rows:
+        most = getattr(row.planner, "most_targets", None)
+        if most is not None and len(largest.targets) > most:
+            raise InputError(f"--planner {row.name}", f"takes at most {most} targets; "
+                             f"{largest.id or 'a mission'} has {len(largest.targets)}")
+
+
+def _causes(found: Sequence[tuple[Row, list[Played]]]) -> list[str]:
+    """A line for each row with failures: why, and how often."""
+    lines = []
+    for row, played in found:
+        counts: dict[str, int] = {}
+        for one in played:
+            if not one.success:
+                words = one.reason.rstrip("0123456789").strip() if "target" in one.reason \
+                    else one.reason
+                counts[words] = counts.get(words, 0) + 1
+        if counts:
+            lines.append(f"{row.name}: " + "; ".join(
+                f"{count} x {why}" for why, count in sorted(counts.items())))
+    return lines
+
+
+def _row(row: Row, one: Played, problem: Timed) -> dict[str, Any]:
+    bound = None if problem.optimal is None else problem.optimal.bound
+    return {"id": one.id, "planner": row.name, "success": one.success, "reason": one.reason,
+            "seconds": one.seconds, "solved": one.solved, "waited": one.waited,
+            "effort": one.effort, "decisions": one.decisions, "lost": one.lost,
+            "optimal": {"bound": bound}}

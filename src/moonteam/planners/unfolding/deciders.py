@@ -1,0 +1,164 @@
+"""Who decides in a mission that unfolds: replanning at every event, and choosing over futures.
+
+Legend: N robots, M targets known of, B missions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from moonteam.planners.seconds.base import MS, TimedPlan, TimedPlanner
+from moonteam.planners.seconds.keeper import HOME, Keeper, choices
+from moonteam.planners.unfolding.future import future
+from moonteam.planners.unfolding.search import Pattern
+from moonteam.planners.unfolding.state import Order
+from moonteam.planners.unfolding.world import View, World
+
+OPTIONS = 6
+"""First moves that are tried at an event."""
+
+NOT_DONE = 2.0
+"""Times its limit that an imagined mission counts which does not end well."""
+
+
+class Decider(Protocol):
+    """Decides in one mission."""
+
+    def act(self, view: View) -> list[Order]:
+        """What each robot does now [N]; of those in service and lost it does not matter."""
+        ...
+
+
+class Replanning:
+    """Plans what is known of anew at every event, and looks no further.
+
+    A plan is kept until another is better, unless `faithful` is off: then the newest counts. Robots
+    that it has nothing for go home, or look for hidden targets by the pattern.
+    """
+
+    def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None,
+                 faithful: bool = True):
+        self._planner, self._pattern, self._faithful = planner, pattern, faithful
+        self._keeper = Keeper(planner, margin_ms=0)
+
+    def act(self, view: View) -> list[Order]:
+        """See `Decider`."""
+        if view.moment.solved.all():
+            return self.settled(view, np.full(len(view.places), HOME))
+        if self._faithful:
+            return self.settled(view, self._keeper.act(view.moment))
+        return self.follow(view, self._planner.plan(view.moment))
+
+    def follow(self, view: View, plan: TimedPlan) -> list[Order]:
+        """What the plan has everybody do first."""
+        return self.settled(view, choices(view.moment, [
+            (one.target, one.agents) for one in plan.services]))
+
+    def settled(self, view: View, chosen: np.ndarray) -> list[Order]:
+        """The choices [N], those who have none looking for what is hidden."""
+        orders: list[Order] = [int(choice) for choice in chosen]
+        if self._pattern is None or not view.coming or view.ground is None:
+            return orders
+        idle = [i for i in np.flatnonzero(view.moment.present & (chosen < 0)).tolist()
+                if view.moment.free[i] == 0 and view.agents[i].sensor is not None]
+        for i, place in self._pattern.look(view, idle).items():
+            orders[i] = place
+        return orders
+
+
+class OverFutures:
+    """Chooses what does best over sampled futures, by playing them to their end.
+
+    At every event so many futures are drawn of what is expected. What everybody could do first
+    comes from the plan of what is known, and from a plan for each of the futures as if it were
+    known; where that leads to a target which nobody knows of yet, its place is gone to. Up to
+    `OPTIONS` of these are tried in every future, and go on by replanning. The least mean makespan
+    wins, if it is under replanning's by more than its standard error: the best of several means of
+    few futures flatters itself.
+
+    Args:
+      planner: by which is planned, in hindsight and when replanning.
+      futures: how many are drawn.
+      seed: of the draws.
+      pattern: by which is looked for what is hidden.
+    """
+
+    def __init__(self, planner: TimedPlanner, futures: int, seed: int = 0,
+                 pattern: Pattern | None = None):
+        self._planner, self._count, self._pattern = planner, futures, pattern
+        self._rng = np.random.default_rng(seed)
+        self._base = Replanning(planner, pattern)
+
+    def act(self, view: View) -> list[Order]:
+        """See `Decider`."""
+        usual = self._base.act(view)
+        if not view.coming and view.expects.loss is None and not view.expects.scatter:
+            return usual
+        drawn = [future(view, self._rng) for _ in range(self._count)]
+        options = [usual]
+        for one in drawn:
+            option = self._hindsight(one.world(view))
+            if option is not None and option not in options and len(options) < OPTIONS:
+                options.append(option)
+        if len(options) == 1:
+            return usual
+        costs = np.array([[self._played(one.world(view), option) for one in drawn]
+                          for option in options])
+        gain = costs[0] - costs
+        best = int(gain.mean(1).argmax())
+        error = float(gain[best].std(ddof=1)) / math.sqrt(self._count)
+        return options[best] if gain[best].mean() > error else usual
+
+    def _hindsight(self, world: World) -> list[Order] | None:
+        """What everybody does first where all that comes is known; None where there is no plan."""
+        targets = len(world.state.targets)
+        view = world.revealed().view()
+        if view.moment.solved.all():
+            return None
+        plan = self._planner.plan(view.moment)
+        if plan.status == "infeasible":
+            return None
+        chosen = choices(view.moment, [(one.target, one.agents) for one in plan.services])
+        return [view.targets[j].at if j >= targets else int(j) for j in chosen.tolist()]
+
+    def _played(self, world: World, first: Sequence[Order]) -> float:
+        """s of an imagined mission, from its start."""
+        goes_on = Replanning(self._planner, self._pattern)
+        world.step(first)
+        while not world.over:
+            world.step(goes_on.act(world.view()))
+        out = world.outcome
+        return out.seconds if out.success else NOT_DONE * world.state.limit / MS
+
+
+def play(worlds: Sequence[World], deciders: Sequence[Decider], tick: Any = None) -> None:
+    """Plays the missions [B] to their ends, one after the other."""
+    for world, decider in zip(worlds, deciders, strict=True):
+        while not world.over:
+            world.step(decider.act(world.view()))
+        if tick is not None:
+            tick(1)
+
+
+def play_together(worlds: Sequence[World], planner: TimedPlanner, deciders: Sequence[Replanning],
+                  tick: Any = None) -> None:
+    """The same side by side [B], for a planner that plans many moments in one call (`plans`)."""
+    left = [k for k, world in enumerate(worlds) if not world.over]
+    while left:
+        views = {k: worlds[k].view() for k in left}
+        asked = [k for k in left if not views[k].moment.solved.all()]
+        moments = [views[k].moment for k in asked]
+        # Always as many, lest it compile anew for every number that is left.
+        plans = cast(Any, planner).plans(moments + moments[:1] * (len(worlds) - len(moments)))
+        orders = {k: deciders[k].follow(views[k], plan)
+                  for k, plan in zip(asked, plans, strict=False)}
+        for k in left:
+            worlds[k].step(orders[k] if k in orders else deciders[k].act(views[k]))
+        now = [k for k in left if not worlds[k].over]
+        if tick is not None:
+            tick(len(left) - len(now))
+        left = now

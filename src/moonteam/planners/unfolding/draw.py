@@ -1,0 +1,93 @@
+"""Families of missions that unfold, on 32 x 32 m, from which the test sets are drawn.
+
+following: the paper's 5 + 5: each of the first five targets that is solved makes way for another;
+one cell a second, along x and y. arrivals: three targets known from the start, five more by a
+clock. hidden: five targets to be found by three robots of unlike speed that see 6 m. losses: teams
+of four robots, three skills and eight targets, and in one mission of three a robot is lost.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from moonteam.grid.scenarios import generate
+from moonteam.planners.seconds.base import MS, moment
+from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.problem import timed
+from moonteam.problem.timed import Known, Loss, Prospect, Timed
+
+AREA = (0.0, 0.0, 31.0, 31.0)
+EVERY_S, SENSOR_M = 10.0, 6.0
+LOSS = Loss(share=1 / 3, until=40.0)
+
+
+@dataclass(frozen=True)
+class Family:
+    """How many of everything, and what is expected."""
+
+    limit_s: float
+    targets: int
+    expects: Prospect
+    agents: int = 3
+    skills: int = 2
+
+
+FAMILIES = {
+    "following": Family(128.0, 10, Prospect(more=5, area=AREA)),
+    "arrivals": Family(300.0, 8, Prospect(more=5, every=EVERY_S, area=AREA)),
+    "hidden": Family(600.0, 5, Prospect(more=5, area=AREA)),
+    "losses": Family(300.0, 8, Prospect(area=AREA, loss=LOSS), agents=4, skills=3)}
+
+
+def draws(name: str, seed: int, speeds: tuple[float, ...]) -> Iterator[Timed]:
+    """Endless missions of a family, which can be solved in hindsight.
+
+    Each robot draws one of the speeds, m/s, but in `following`.
+    """
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    while True:
+        made = _with_bound(_draw(name, rng, speeds))
+        if made is not None:
+            yield made
+
+
+def _draw(name: str, rng: np.random.Generator, speeds: tuple[float, ...]) -> Timed:
+    family = FAMILIES[name]
+    known = timed.of(generate(rng, num_agents=family.agents, num_targets=family.targets,
+                              num_skills=family.skills))
+    targets, agents = list(known.targets), list(known.agents)
+    first = family.targets - family.expects.more
+    change = msgspec.structs.replace
+    if name != "following":
+        agents = [change(agent, speed=float(rng.choice(speeds))) for agent in agents]
+    if name == "following":
+        targets[first:] = [change(t, following=k) for k, t in enumerate(targets[first:], 1)]
+    elif name == "arrivals":
+        times = np.cumsum(rng.exponential(EVERY_S, family.expects.more)).round(3).tolist()
+        targets[first:] = [change(t, appears=s)
+                           for t, s in zip(targets[first:], times, strict=True)]
+    elif name == "hidden":
+        targets = [change(t, hidden=True) for t in targets]
+        agents = [change(agent, sensor=SENSOR_M) for agent in agents]
+    elif rng.random() < LOSS.share:
+        i = int(rng.integers(len(agents)))
+        agents[i] = change(agents[i], lost=round(float(rng.uniform(0, LOSS.until)), 3))
+    return change(known, metric="manhattan" if name == "following" else "straight",
+                  max_seconds=family.limit_s, agents=tuple(agents), targets=tuple(targets),
+                  expects=family.expects)
+
+
+def _with_bound(problem: Timed) -> Timed | None:
+    """With the least makespan in hindsight, all known from the start and nobody lost.
+
+    Nobody can be faster. None where that is more than the limit.
+    """
+    plan = ExactPlanner("makespan").plan(moment(problem))
+    if plan.status != "optimal" or plan.makespan is None:
+        return None
+    return msgspec.structs.replace(problem, optimal=Known(bound=plan.makespan / MS))
