@@ -112,14 +112,16 @@ def again(path: Path, who: Who, row: int) -> str:
 
 def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any]:
     from moonteam.report import provenance
-    from sim2grid.study.soak import BLOCK, failures, memory, who_decides
+    from sim2grid.study.soak import BLOCK, FORGET, failures, memory, who_decides
 
     line = memory(entries)
     wall = sum(entry.wall_s for entry in entries)
     notes = [f"Resident memory: {line['first_mib']} MiB after the first mission, "
              f"{line['last_mib']} after the last, {line['most_mib']} at most; the line through it "
              f"rises by {line['slope']} MiB a 1000 missions, over the second half by "
-             f"{line['slope_second_half']}.",
+             f"{line['slope_second_half']}. What was compiled is dropped every {BLOCK * FORGET} "
+             f"missions; lowest of each: {_mib(line['lowest_mib'])}; highest: "
+             f"{_mib(line['highest_mib'])}.",
              f"{3600 * len(entries) / max(wall, 1e-9):.0f} missions an hour."]
     return {"kind": "soak", "title": f"soak: {len(entries)} missions",
             "meta": provenance.meta(command.line("evaluate soak", args), args.seed),
@@ -130,6 +132,10 @@ def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any
                                              entry.number % BLOCK)
                          for entry in entries if not entry.success},
             "tracebacks": {entry.number: entry.traceback for entry in entries if entry.traceback}}
+
+
+def _mib(values: list[float]) -> str:
+    return ", ".join(f"{value:.0f}" for value in values)
 
 
 def _tables(entries: list[Entry]) -> list[tuple[list[str], list[list[str]]]]:

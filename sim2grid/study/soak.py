@@ -352,15 +352,22 @@ def _at_second(event: Event) -> Event:
                                    silent=silent)
 
 
-def memory(entries: list[Entry]) -> dict[str, float | None]:
+def memory(entries: list[Entry]) -> dict[str, Any]:
     """The line through resident memory against missions, MiB a 1000 missions: over all of them
     and over the second half, when all shapes have been compiled. Each process has its own offset.
+
+    Within a stretch of `FORGET` blocks memory rises, for what was compiled is kept; what does not
+    come back after it is a leak, so the lowest and highest of each stretch stand beside the line.
     """
     half = entries[len(entries) // 2:]
+    stretches = [[e.resident_mib for e in group] for _, group in itertools.groupby(
+        entries, key=lambda entry: entry.number // (FORGET * BLOCK))]
     return {"first_mib": entries[0].resident_mib if entries else None,
             "last_mib": entries[-1].resident_mib if entries else None,
             "most_mib": max((e.resident_mib for e in entries), default=None),
-            "slope": _slope(entries), "slope_second_half": _slope(half)}
+            "slope": _slope(entries), "slope_second_half": _slope(half),
+            "lowest_mib": [min(one) for one in stretches],
+            "highest_mib": [max(one) for one in stretches]}
 
 
 def _slope(entries: list[Entry]) -> float | None:

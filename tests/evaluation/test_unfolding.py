@@ -55,7 +55,7 @@ def test_a_policy_plays_a_set_side_by_side_as_it_plays_one_mission():
     assert row.together
     side_by_side = row.play_all(problems)
     assert all(played.success for played in side_by_side)
-    alone = row.play(problems[1], 0, 0)
+    (alone,) = row.play_all(problems[1:2])
     assert (side_by_side[1].seconds, side_by_side[1].decisions) == (alone.seconds, alone.decisions)
 
 

@@ -1,4 +1,4 @@
-"""`moonteam train quick|paper_team|any_team`: MAPPO on macro-decisions, from scratch."""
+"""`moonteam train quick|paper_team|any_team|unfolding`: MAPPO on macro-decisions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from training.sharding import devices_here
 @dataclass(frozen=True)
 class Args(Together, Apart, Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
-    on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one).
+    on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one);
+    unfolding where not everything is known.
 
     A decision is a target, held until something happens. Every number of the preset can be
     changed by an option.
@@ -149,6 +150,11 @@ def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
     if not args.policy:
         return args.config, None, ""
     spec, params = _pointer(args.policy)
+    if args.config.spec.unfolds and not spec.unfolds:
+        from moonteam.policies import pointer
+
+        spec = dataclasses.replace(spec, unfolds=True)
+        params = pointer.grafted(spec, params)
     return dataclasses.replace(args.config, spec=spec), params, args.policy
 
 

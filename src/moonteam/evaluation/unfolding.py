@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,15 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import TimedPlanner
-from moonteam.planners.unfolding.deciders import Decider, OverFutures, Replanning, play_together
+from moonteam.planners.seconds.policy import PolicyPlanner
+from moonteam.planners.unfolding.deciders import (
+    Decider,
+    OverFutures,
+    Replanning,
+    planned,
+    play_together,
+)
+from moonteam.planners.unfolding.pointing import Pointing
 from moonteam.planners.unfolding.search import NearestUnseen, Pattern, Sweep
 from moonteam.planners.unfolding.state import Outcome
 from moonteam.planners.unfolding.world import World
@@ -53,14 +62,14 @@ class Row:
     futures: int = 0
     pattern: str = ""
     together: bool = False
-    """Its planner plans many moments in one call, and is followed as it says last."""
+    """It decides in many missions in one call, as it says last."""
 
     def decider(self, number: int, seed: int) -> Decider:
         """Who decides in mission `number`."""
         pattern = PATTERNS[self.pattern]() if self.pattern else None
         if self.futures:
             return OverFutures(self.planner, self.futures, seed * 1_000_003 + number, pattern)
-        return Replanning(self.planner, pattern, faithful=not self.together)
+        return Replanning(self.planner, pattern)
 
     def play(self, problem: Timed, number: int, seed: int) -> Played:
         """One mission."""
@@ -73,10 +82,13 @@ class Row:
     def play_all(self, problems: Sequence[Timed]) -> list[Played]:
         """All missions, side by side."""
         worlds = [World(problem) for problem in problems]
-        deciders = [Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None,
-                               faithful=False) for _ in problems]
+        deciders = [Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None)
+                    for _ in problems]
+        planner, choose = self.planner, partial(planned, self.planner)
+        if isinstance(planner, PolicyPlanner) and planner.tries == 1 and planner.heat == 0.0:
+            choose = Pointing(planner.policy, planner.preference).choose
         began = time.perf_counter()
-        play_together(worlds, self.planner, deciders)
+        play_together(worlds, choose, deciders)
         each = (time.perf_counter() - began) / max(len(problems), 1)
         return [Played.of(problem, world.outcome, each)
                 for problem, world in zip(problems, worlds, strict=True)]

@@ -40,6 +40,8 @@ class PointerSpec:
     """Attention blocks."""
     pairs: int = 32
     """Features of a pair of tokens."""
+    unfolds: bool = False
+    """Sees how many targets are still to come, and how far everything is from where they may."""
 
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no network."""
@@ -71,6 +73,7 @@ class Outlook:
     after: Array  # [B, M, M] bool, after[j, k]: j waits for k
     home: Array  # [B, N, M] time from the target home
     preference: Array  # [B] 0 time .. 1 effort
+    ahead: Array | None = None  # [B, E, 3] log of how many come, time to where, and both at once
 
 
 def look(state: MacroState, preference: Array) -> Outlook:
@@ -79,7 +82,7 @@ def look(state: MacroState, preference: Array) -> Outlook:
     targets = p.start.shape[1]
     lacks = world.missing(p, state.goal)
     incomplete = jnp.any(lacks > 0, axis=1)
-    shown = state.now >= p.shown - world.SOON
+    shown = world.known(state)
     open_ = world.open_targets(state) & incomplete
     bound = state.goal < targets
     here = jnp.minimum(state.goal, targets - 1)
@@ -123,7 +126,17 @@ def look(state: MacroState, preference: Array) -> Outlook:
         travel=norm(travel), between=norm(best), goal=goal, has=p.has, lacks=lacks,
         either=p.either, service=norm(p.service), ready=norm(ready),
         left=norm(jnp.maximum(p.lapses - state.now, 0.0)), after=waits, home=norm(p.home),
-        preference=preference)
+        preference=preference, ahead=_ahead(state))
+
+
+def _ahead(state: MacroState) -> Array:
+    """[E, 3] what of the future concerns each token; all 0 where nothing more comes."""
+    p = state.problem
+    count = jnp.log1p(world.coming(state).astype(jnp.float32))
+    agents = jnp.where(p.agent_mask, world.middle_of(state, state.node), 0.0)
+    far = jnp.concatenate([agents, jnp.where(p.target_mask, p.middle, 0.0)]) / p.unit
+    far = jnp.where(count > 0, jnp.minimum(far, LONG), 0.0)
+    return jnp.stack([jnp.broadcast_to(count, far.shape), far, count * far], axis=-1)
 
 
 def _token_features(view: Outlook) -> tuple[Array, Array]:
@@ -222,6 +235,10 @@ class Pointer(nn.Module):
         n = agents.shape[-2]
         x = jnp.concatenate([nn.Dense(spec.width, name="agent")(agents),
                              nn.Dense(spec.width, name="target")(targets)], axis=-2)
+        if spec.unfolds:  # zeros at first: it begins as what it was before it saw that
+            assert view.ahead is not None
+            x = x + nn.Dense(spec.width, use_bias=False, name="ahead",
+                             kernel_init=nn.initializers.zeros)(view.ahead)
         mask = jnp.concatenate([view.agents, view.targets], axis=-1)
         pairs = nn.gelu(nn.Dense(spec.pairs, name="pairs")(_pair_features(view)))
         x = attention.attend(x, pairs, mask, n, spec.layers, spec.heads)
@@ -242,6 +259,13 @@ def point(params: Any, spec: PointerSpec, view: Outlook) -> Pointed:
     return cast(Pointed, Pointer(spec).apply({"params": params}, view))
 
 
+def grafted(spec: PointerSpec, params: Any) -> Any:
+    """Parameters of a network that does not see what is to come, for one that does: it begins as
+    the same policy.
+    """
+    return {**params, "ahead": init(spec, jax.random.key(0))["ahead"]}
+
+
 def init(spec: PointerSpec, key: Array) -> Any:
     """Fresh parameters; their shapes hold for teams of any size."""
     flag, number = jnp.zeros(2, bool), jnp.zeros(2)
@@ -249,5 +273,6 @@ def init(spec: PointerSpec, key: Array) -> Any:
     view = Outlook(
         agents=~flag, targets=~flag, free=~flag, spare=number, slow=number, travel=square,
         between=square, goal=square > 0, has=square > 0, lacks=square, either=flag, service=number,
-        ready=number, left=number, after=square > 0, home=square, preference=jnp.zeros(()))
+        ready=number, left=number, after=square > 0, home=square, preference=jnp.zeros(()),
+        ahead=jnp.zeros((4, 3)))
     return Pointer(spec).init(key, view)["params"]

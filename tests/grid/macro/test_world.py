@@ -135,6 +135,8 @@ def team(has, need, start, between, **changes):
         between=np.tile(np.array(between, np.float32), (n, 1, 1)),
         home=np.zeros((n, m), np.float32), home_now=np.zeros(n, np.float32), has=has, need=need,
         either=zero > 0, service=zero, after=np.zeros((m, m), bool), appears=zero, shown=zero,
+        following=np.zeros(m, np.int32), coming=np.int32(0), middle=zero,
+        middle_now=np.zeros(n, np.float32),
         lapses=zero + FAR, free=np.zeros(n, np.float32), effort=np.ones(n, np.float32),
         limit=np.float32(FAR), agent_mask=np.ones(n, bool), target_mask=np.ones(m, bool),
         unit=np.float32(1.0)), **changes)

@@ -94,3 +94,6 @@ def test_the_line_through_memory_leaves_out_what_a_process_begins_with():
     assert soak.memory(line)["slope"] == pytest.approx(10.0)
     assert soak.memory(line)["slope_second_half"] == pytest.approx(10.0)
     assert soak.memory([])["slope"] is None
+    saw = [entry(k, 100.0 + k % (soak.FORGET * soak.BLOCK)) for k in range(450)]
+    assert soak.memory(saw)["lowest_mib"] == [100.0, 100.0, 100.0]
+    assert soak.memory(saw)["highest_mib"] == [299.0, 299.0, 149.0]

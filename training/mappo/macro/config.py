@@ -161,4 +161,13 @@ PRESETS = {
         ),
         # Of many targets returns are long, and their squared error could drown the choices.
         rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5),
+    "unfolding": MacroConfig(
+        "unfolding", (
+            Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),
+            Practice("3 + 5, the next by a clock",
+                     Draw(targets=(8, 8), metric="straight", speeds=(1.5, 0.36, 0.47),
+                          arriving=5, every=10.0, limit=300.0)),
+        ),
+        # What comes makes returns noisy: a branch may move the policy less.
+        rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
 }

@@ -106,6 +106,18 @@ class Draw:
     """Share of problems in which every robot has to be back where it started."""
     limit: float = 128.0
     """s in which everything must be done."""
+    following: int = 0
+    """Targets, the last of a problem: nobody knows of the first of them before one is solved, of
+    the next before two are, and so on."""
+    arriving: int = 0
+    """Targets, the last of a problem, that nobody knows of before their time."""
+    every: float = 10.0
+    """Mean s between such times."""
+
+    @property
+    def unfolds(self) -> bool:
+        """Whether not everything is known from the start."""
+        return bool(self.following or self.arriving)
 
     @property
     def config(self) -> EnvConfig:
@@ -129,7 +141,37 @@ def draw(family: Draw, key: Array) -> MacroProblem:
         made = jax.tree.map(lambda a, b: jnp.where(straight, b, a), *made)
     else:
         made = of_grid(problem, cells, family.limit, family.metric, speed, family.num_skills)
-    return trees.single(asking(family, made, more))
+    made = asking(family, made, more)
+    if family.unfolds:
+        made = unfolding(family, made, problem, cells, speed, jax.random.fold_in(more, 1))
+    return trees.single(made)
+
+
+def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, speed: Array,
+              key: Array) -> MacroProblem:
+    """The problem, its last targets to follow on others or to arrive by a clock."""
+    targets = made.start.shape[1]
+    count = jnp.sum(made.target_mask)
+    turn = jnp.arange(targets) - (count - max(family.following, family.arriving)) + 1
+    late = made.target_mask & (turn > 0)
+    if family.following:
+        made = replace(made, following=jnp.where(late, turn, 0).astype(jnp.int32))
+    else:
+        gaps = family.every * jax.random.exponential(key, (targets,))
+        when = jnp.where(late, jnp.cumsum(jnp.where(late, gaps, 0.0)), 0.0)
+        made = replace(made, appears=when, shown=when)
+    metric: Metric = "manhattan" if family.metric == "manhattan" else "straight"
+    fastest = jnp.max(jnp.where(made.agent_mask, speed, 0.0))
+    spots = places(jnp.zeros(2), problem.size - 1.0)
+    mean = lambda at: jnp.mean(apart(at, spots, metric), axis=1) / fastest
+    return replace(made, middle=mean(problem.target_cells), middle_now=mean(cells))
+
+
+def places(low: Array, high: Array, along: int = 8) -> Array:
+    """[P, 2] of a rectangle, evenly: the middles of `along` times `along` parts."""
+    share = (jnp.arange(along) + 0.5) / along
+    grid = jnp.stack(jnp.meshgrid(share, share), axis=-1).reshape(-1, 2)
+    return low[None] + grid * (high - low)[None]
 
 
 def paces(family: Draw, key: Array) -> Array:

@@ -36,6 +36,10 @@ class MacroProblem:
     after: Array  # [M, M] bool, after[j, k]: j starts when k has ended
     appears: Array  # [M] s before which j does not start
     shown: Array  # [M] s before which nobody knows of j
+    following: Array  # [M] int32, targets that are solved before anybody knows of j
+    coming: Array  # [] int32, targets still to be known of that have no entry here
+    middle: Array  # [M] s from j to where targets may come, in the mean; 0 where nobody can say
+    middle_now: Array  # [N] the same from where each agent starts
     lapses: Array  # [M] s after which j does not start; FAR where it does not lapse
     free: Array  # [N] s at which each agent can first set out
     effort: Array  # [N] what a second of travel costs each agent
@@ -55,6 +59,8 @@ def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: 
         start=start, between=between, home=xp.zeros((agents, targets), xp.float32),
         home_now=nobody, has=has, need=need, either=either, service=none,
         after=xp.zeros((targets, targets), bool), appears=none, shown=none,
+        following=xp.zeros(targets, xp.int32), coming=xp.zeros((), xp.int32), middle=none,
+        middle_now=nobody,
         lapses=none + xp.float32(FAR), free=nobody, effort=nobody + 1, limit=limit,
         agent_mask=agent_mask, target_mask=target_mask, unit=unit)
 

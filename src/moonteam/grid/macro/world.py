@@ -62,9 +62,30 @@ def missing(problem: MacroProblem, goal: Array) -> Array:
     return jnp.where(met[:, None], 0, jnp.maximum(problem.need - there, 0))
 
 
+def known(state: MacroState) -> Array:
+    """[M] bool: somebody knows of it, be it solved or not."""
+    problem = state.problem
+    count = jnp.sum(state.solved & problem.target_mask)
+    return (state.now >= problem.shown - SOON) & (problem.following <= count)
+
+
 def open_targets(state: MacroState) -> Array:
     """[M] bool: known, neither solved nor being served."""
-    return ~state.solved & ~state.serving & (state.now >= state.problem.shown - SOON)
+    return ~state.solved & ~state.serving & known(state)
+
+
+def coming(state: MacroState) -> Array:
+    """[] int32, targets that are still to be known of."""
+    problem = state.problem
+    return problem.coming + jnp.sum(problem.target_mask & ~known(state), dtype=jnp.int32)
+
+
+def middle_of(state: MacroState, node: Array) -> Array:
+    """[N] s to where targets may come, in the mean, from where each agent is (`node` [N])."""
+    problem = state.problem
+    targets = problem.start.shape[1]
+    at = problem.middle[jnp.minimum(node, targets - 1)]
+    return jnp.where(node == targets, problem.middle_now, at)
 
 
 def allowed(state: MacroState, goal: Array) -> Array:
@@ -198,8 +219,12 @@ def loosen(state: MacroState, who: Array) -> MacroState:
     near, far = _way_home(problem, state.origin), _way_home(problem, state.node)
     # Of those that need not go home both are 0, where nobody has anywhere to go.
     home = jnp.where((near <= 0) & (far <= 0), 0.0, along(near, far, state.leg - rest, rest))
+    gone = state.leg - rest
+    middle = (rest * middle_of(state, state.origin) + gone * middle_of(state, state.node)
+              ) / jnp.maximum(gone + rest, SOON)
     out = replace(problem, start=jnp.where(who[:, None], start, problem.start),
-                  home_now=jnp.where(who, home, problem.home_now))
+                  home_now=jnp.where(who, home, problem.home_now),
+                  middle_now=jnp.where(who, middle, problem.middle_now))
     travelled = state.travelled - jnp.where(who, rest, 0.0)
     return replace(
         state, problem=out, travelled=travelled, node=jnp.where(who, targets, state.node),

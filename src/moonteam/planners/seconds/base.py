@@ -59,6 +59,9 @@ class Moment:
     ends: Int64  # [M] ms at which the service of a target under way ends; 0 of others
     effort: npt.NDArray[np.float64]  # [N] what a ms of travel costs each agent
     limit: int = NEVER  # ms in which everything must be done
+    coming: int = 0  # targets that are still to be known of
+    middle: Int64 | None = None  # [M] ms from each target to where they may come, in the mean
+    middle_now: Int64 | None = None  # [N] the same from where each agent is
 
     @property
     def plain(self) -> bool:

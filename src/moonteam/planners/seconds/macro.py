@@ -24,11 +24,15 @@ def problem_of(now: Moment) -> MacroProblem:
     start = _seconds(now.start)
     has = now.has & now.present[:, None]
     need = np.where(now.solved[:, None], 0, now.need).astype(np.int32)
-    columns: dict[str, np.ndarray | np.float32] = {
+    columns: dict[str, np.ndarray | np.float32 | np.int32] = {
         "start": start, "between": _seconds(now.between[now.classes]),
         "home": _seconds(now.home), "home_now": _seconds(now.home_now), "has": has, "need": need,
         "either": now.either, "service": _seconds(now.service), "after": now.after,
         "appears": _seconds(np.maximum(now.appears, under_way)), "shown": zero,
+        "following": np.zeros(len(zero), np.int32), "coming": np.int32(now.coming),
+        "middle": zero if now.middle is None else _seconds(now.middle),
+        "middle_now": np.zeros(len(start), np.float32) if now.middle_now is None
+        else _seconds(now.middle_now),
         "lapses": _seconds(now.lapses), "free": _seconds(now.free),
         "effort": now.effort.astype(np.float32), "limit": _seconds(np.asarray(now.limit)),
         "agent_mask": now.present, "target_mask": ~now.solved, "unit": unit_of(start, has, need)}

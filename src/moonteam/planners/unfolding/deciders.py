@@ -6,12 +6,12 @@ Legend: N robots, M targets known of, B missions.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
 
-from moonteam.planners.seconds.base import MS, TimedPlan, TimedPlanner
+from moonteam.planners.seconds.base import MS, Moment, TimedPlanner
 from moonteam.planners.seconds.keeper import HOME, Keeper, choices
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.search import Pattern
@@ -36,27 +36,19 @@ class Decider(Protocol):
 class Replanning:
     """Plans what is known of anew at every event, and looks no further.
 
-    A plan is kept until another is better, unless `faithful` is off: then the newest counts. Robots
-    that it has nothing for go home, or look for hidden targets by the pattern.
+    A plan is kept until another is better. Robots that it has nothing for go home, or look for
+    hidden targets by the pattern.
     """
 
-    def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None,
-                 faithful: bool = True):
-        self._planner, self._pattern, self._faithful = planner, pattern, faithful
+    def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None):
+        self._pattern = pattern
         self._keeper = Keeper(planner, margin_ms=0)
 
     def act(self, view: View) -> list[Order]:
         """See `Decider`."""
         if view.moment.solved.all():
             return self.settled(view, np.full(len(view.places), HOME))
-        if self._faithful:
-            return self.settled(view, self._keeper.act(view.moment))
-        return self.follow(view, self._planner.plan(view.moment))
-
-    def follow(self, view: View, plan: TimedPlan) -> list[Order]:
-        """What the plan has everybody do first."""
-        return self.settled(view, choices(view.moment, [
-            (one.target, one.agents) for one in plan.services]))
+        return self.settled(view, self._keeper.act(view.moment))
 
     def settled(self, view: View, chosen: np.ndarray) -> list[Order]:
         """The choices [N], those who have none looking for what is hidden."""
@@ -135,30 +127,33 @@ class OverFutures:
         return out.seconds if out.success else NOT_DONE * world.state.limit / MS
 
 
-def play(worlds: Sequence[World], deciders: Sequence[Decider], tick: Any = None) -> None:
-    """Plays the missions [B] to their ends, one after the other."""
-    for world, decider in zip(worlds, deciders, strict=True):
-        while not world.over:
-            world.step(decider.act(world.view()))
-        if tick is not None:
-            tick(1)
+def play_together(worlds: Sequence[World], choose: Callable[[list[Moment]], list[np.ndarray]],
+                  deciders: Sequence[Replanning]) -> None:
+    """Plays missions [B] side by side to their ends.
 
-
-def play_together(worlds: Sequence[World], planner: TimedPlanner, deciders: Sequence[Replanning],
-                  tick: Any = None) -> None:
-    """The same side by side [B], for a planner that plans many moments in one call (`plans`)."""
+    Args:
+      worlds: [B].
+      choose: what everybody goes for, of several moments in one call, [N] each.
+      deciders: [B], for who looks for what is hidden.
+    """
     left = [k for k, world in enumerate(worlds) if not world.over]
     while left:
         views = {k: worlds[k].view() for k in left}
         asked = [k for k in left if not views[k].moment.solved.all()]
         moments = [views[k].moment for k in asked]
         # Always as many, lest it compile anew for every number that is left.
-        plans = cast(Any, planner).plans(moments + moments[:1] * (len(worlds) - len(moments)))
-        orders = {k: deciders[k].follow(views[k], plan)
-                  for k, plan in zip(asked, plans, strict=False)}
+        found = choose(moments + moments[:1] * (len(worlds) - len(moments))) if asked else []
+        orders = {k: deciders[k].settled(views[k], chosen)
+                  for k, chosen in zip(asked, found, strict=False)}
         for k in left:
             worlds[k].step(orders[k] if k in orders else deciders[k].act(views[k]))
-        now = [k for k in left if not worlds[k].over]
-        if tick is not None:
-            tick(len(left) - len(now))
-        left = now
+        left = [k for k in left if not worlds[k].over]
+
+
+def planned(planner: TimedPlanner, moments: list[Moment]) -> list[np.ndarray]:
+    """[B] of [N]: what the plans of a planner that takes many moments (`plans`) have everybody do
+    first.
+    """
+    plans = cast(Any, planner).plans(moments)
+    return [choices(moment, [(one.target, one.agents) for one in plan.services])
+            for moment, plan in zip(moments, plans, strict=True)]

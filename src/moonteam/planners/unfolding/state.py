@@ -20,6 +20,9 @@ from moonteam.problem.timed import Place, Target, Timed
 Order = int | Place
 """A known target's number, HOME, WAIT, or a place to go to and look."""
 
+PARTS = 8
+"""Along each side of the area in which targets may be, for the mean way there."""
+
 NO_LIMIT_S = 1e6
 """s after which a mission without a limit ends."""
 
@@ -119,8 +122,8 @@ class State:
             self._table = self._tabled()
         return self._table
 
-    def moment(self) -> Moment:
-        """The mission as planners by the clock take it."""
+    def moment(self, coming: int = 0) -> Moment:
+        """The mission as planners by the clock take it, with so many targets to be known of."""
         table, agents = self.table, self.problem.agents
         here = np.array([self.place(i) for i in range(len(agents))], float)
         speeds = np.array([agent.speed for agent in agents])
@@ -140,7 +143,22 @@ class State:
             present=np.array([body.phase != "lost" for body in self.bodies], bool),
             solved=np.array(self.served_at, np.int64) >= 0,
             ends=np.maximum(np.array(self.ends, np.int64) - self.now, 0),
-            effort=np.ones(len(agents)), limit=max(self.limit - self.now, 0))
+            effort=np.ones(len(agents)), limit=max(self.limit - self.now, 0), coming=coming,
+            middle=self._middle(table.spots) if coming else None,
+            middle_now=self._middle(here) if coming else None)
+
+    def _middle(self, spots: Floats) -> Int64 | None:
+        """[A] ms from places [A, 2] to where targets may be, in the mean, for the fastest; None
+        where that is not said.
+        """
+        area = None if self.problem.expects is None else self.problem.expects.area
+        if area is None:
+            return None
+        share = (np.arange(PARTS) + 0.5) / PARTS
+        low, high = np.array(area[:2]), np.array(area[2:])
+        places = low + np.stack(np.meshgrid(share, share), -1).reshape(-1, 2) * (high - low)
+        mean = distances(spots, places, self.problem.metric).mean(1)
+        return _ms(mean, max(agent.speed for agent in self.problem.agents))
 
     def _tabled(self) -> Table:
         agents, targets, metric = self.problem.agents, self.targets, self.problem.metric

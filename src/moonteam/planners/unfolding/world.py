@@ -105,10 +105,11 @@ class World:
 
     def view(self) -> View:
         """What is known now."""
-        state = self.state
+        state, coming = self.state, len(self._coming)
         places = np.array([state.place(i) for i in range(len(state.bodies))], float)
-        return View(state.now, state.moment(), tuple(state.targets), places, state.problem.agents,
-                    state.problem.expects or Prospect(), len(self._coming), state.ground, state)
+        return View(state.now, state.moment(coming), tuple(state.targets), places,
+                    state.problem.agents, state.problem.expects or Prospect(), coming,
+                    state.ground, state)
 
     def step(self, orders: Sequence[Order]) -> None:
         """Everybody in no service does as told [N]; then to the next event at which to decide."""

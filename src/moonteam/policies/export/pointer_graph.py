@@ -13,6 +13,7 @@ from typing import Any
 
 from onnx import ModelProto, helper
 
+from moonteam.errors import InputError
 from moonteam.grid.macro.types import LONG
 from moonteam.policies.export.graph import BOOL, FLOAT, INT, LAST, Graph, block, by_role, model
 from moonteam.policies.pointer import PointerSpec
@@ -134,7 +135,13 @@ def _point(g: Graph, spec: PointerSpec, x: str, pairs: str, spans: dict[str, Any
 
 
 def pointer_graph(policy: PolicyFile, spec: PointerSpec) -> ModelProto:
-    """The pointing network; its output is `logits` [B, N, M + 1], each target, then waiting."""
+    """The pointing network; its output is `logits` [B, N, M + 1], each target, then waiting.
+
+    Raises InputError for one that sees what is still to come: that is no input of the file.
+    """
+    if spec.unfolds:
+        raise InputError("export", "a policy for missions that unfold is not exported; it sees "
+                         "what is still to come, which is no input of the file")
     g = Graph(policy.params)
     agents, targets = _tokens(g)
     x = g.join(g.dense(g.params["agent"], agents), g.dense(g.params["target"], targets), axis=1)

@@ -1,0 +1,98 @@
+"""The macro world in which targets follow or arrive, beside the planners' world."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+
+from moonteam import loading, paths
+from moonteam.grid.macro import draw, world
+from moonteam.planners.macro import stacked
+from moonteam.planners.seconds.base import MS, moment
+from moonteam.planners.seconds.macro import problem_of
+from moonteam.planners.unfolding.world import World
+
+FOLLOWING = draw.Draw(targets=(8, 10), following=5)
+ARRIVING = draw.Draw(targets=(8, 8), metric="straight", speeds=(1.5, 0.36), arriving=5, limit=300.0)
+
+
+@jax.jit
+def decided(state, logits):
+    """What is chosen, and the state after it; choices are held, for half-way along the lattice both
+    worlds part: this one takes the way as straight.
+    """
+    choice, _ = world.choose(state, logits, jnp.zeros_like(logits))
+    result = world.step(state, choice)
+    over = result.terminated | result.truncated
+    return choice, result.state, over, world.known(state), world.coming(state)
+
+
+def test_both_worlds_go_alike_event_by_event():
+    """Random choices in missions of which the half follows: when what is solved and known of.
+
+    Without coalitions: there this world waits for all who are bound, the other for enough of them.
+    """
+    held = loading.load_set(paths.find("unfolding/following", "testsets", ".jsonl"))[:12]
+    rng = np.random.default_rng(0)
+    for held_one in held:
+        alone = tuple(msgspec.structs.replace(t, type="OR") for t in held_one.targets)
+        mission = msgspec.structs.replace(held_one, targets=alone)
+        whole = problem_of(moment(mission))
+        following = np.array([target.following for target in mission.targets], np.int32)
+        problem = jax.tree.map(lambda x: x[0], stacked([replace(whole, following=following)]))
+        state, own = world.reset(problem), World(mission)
+        for _ in range(40):
+            logits = rng.normal(0, 2, (3, problem.start.shape[1] + 1)).astype(np.float32)
+            free = np.asarray(world.free(state))
+            choice, after, over, known, coming = jax.device_get(decided(state, logits))
+            assert own.state.now / MS == pytest.approx(float(state.now), abs=2e-3)
+            real = known & np.asarray(problem.target_mask)
+            assert sorted(own.state.numbers) == np.flatnonzero(real).tolist()
+            assert own.view().coming == coming
+            orders = [
+                body.goal if not is_free else own.state.numbers.index(int(pick))
+                if pick < problem.start.shape[1] else -1
+                for body, is_free, pick in zip(own.state.bodies, free, choice, strict=True)]
+            own.step(orders)
+            state = after
+            if over:
+                break
+        assert own.over
+        assert own.outcome.success == bool(np.asarray(state.solved).all())
+
+
+@pytest.mark.parametrize("family", [FOLLOWING, ARRIVING], ids=["following", "arriving"])
+def test_the_last_targets_are_not_known_at_the_start(family):
+    made = jax.vmap(partial(draw.draw, family))(jax.random.split(jax.random.key(0), 64))
+    states = jax.jit(jax.vmap(world.reset))(made)
+    known = np.asarray(jax.vmap(world.known)(states)) & np.asarray(made.target_mask)
+    count = np.asarray(made.target_mask).sum(1)
+    assert (known.sum(1) == count - 5).all()
+    assert (np.asarray(jax.vmap(world.coming)(states)) == 5).all()
+    options = jax.vmap(world.allowed)(states, states.goal)
+    assert not (np.asarray(options) & ~known[:, None]).any()
+
+
+def test_times_between_arrivals_have_the_mean_that_is_asked_for():
+    made = jax.vmap(partial(draw.draw, ARRIVING))(jax.random.split(jax.random.key(1), 2000))
+    shown = np.asarray(made.shown)[:, 3:]
+    assert np.diff(shown, axis=1).mean() == pytest.approx(ARRIVING.every, rel=0.05)
+    np.testing.assert_array_equal(made.shown, made.appears)
+
+
+def test_the_mean_way_to_what_comes_is_the_same_in_both_worlds():
+    mission = loading.load_set(paths.find("unfolding/arrivals", "testsets", ".jsonl"))[0]
+    now = World(mission).view().moment
+    agents = jnp.array([agent.at for agent in mission.agents])
+    spots = draw.places(jnp.zeros(2), jnp.array([31.0, 31.0]))
+    fastest = max(agent.speed for agent in mission.agents)
+    mean = jnp.mean(draw.apart(agents, spots, "straight"), axis=1) / fastest
+    np.testing.assert_allclose(now.middle_now / MS, mean, atol=2e-3)
+    assert now.coming == 5
+    np.testing.assert_allclose(problem_of(now).middle_now, mean, atol=2e-3)
+    # Where nothing is to come, nothing is said of it.
+    assert problem_of(moment(mission)).middle_now.tolist() == [0.0, 0.0, 0.0]
