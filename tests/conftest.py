@@ -1,5 +1,6 @@
 """What every test shares: strict JAX, and what was compiled once is kept."""
 
+import contextlib
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -9,11 +10,26 @@ os.environ.setdefault("JAX_NUM_CPU_DEVICES", "1")
 import jax
 import pytest
 
-from moonteam.compilation import enable_cache
+from moonteam.compilation import enable_cache, forget
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 enable_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+MAPS = 20_000
+"""Of Linux' 65,530 for a process, after which what is compiled is dropped: ten or so are a
+program's, and XLA aborts when there are no more.
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def room_for_programs():
+    """Drops compiled programs after a file of tests, where there are many."""
+    yield
+    with contextlib.suppress(OSError), open("/proc/self/maps", encoding="ascii") as maps:
+        if sum(1 for _ in maps) > MAPS:
+            forget()
 
 
 @pytest.fixture(scope="session")

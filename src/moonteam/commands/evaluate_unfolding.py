@@ -51,7 +51,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     """By the clock: auto, exact, greedy, lns, policy, another package's, or FILE.py:OBJECT; again
     for more rows. Default: exact."""
     futures: Many[tuple[int, ...]] = ()
-    """Also over so many sampled futures; again for more rows. Not for policies."""
+    """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
+    themselves in the futures."""
     search: Many[tuple[Search, ...]] = ()
     """Where targets are hidden: nearest or sweep; again for more rows. Default: both."""
     policy: Many[tuple[str, ...]] = ()

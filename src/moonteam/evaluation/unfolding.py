@@ -17,8 +17,10 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import TimedPlanner
+from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.policy import PolicyPlanner
 from moonteam.planners.unfolding.deciders import (
+    Choose,
     Decider,
     OverFutures,
     Replanning,
@@ -67,9 +69,11 @@ class Row:
     def decider(self, number: int, seed: int) -> Decider:
         """Who decides in mission `number`."""
         pattern = PATTERNS[self.pattern]() if self.pattern else None
-        if self.futures:
-            return OverFutures(self.planner, self.futures, seed * 1_000_003 + number, pattern)
-        return Replanning(self.planner, pattern)
+        if not self.futures:
+            return Replanning(self.planner, pattern)
+        choose = pointing(self.planner)
+        planner = self.planner if choose is None else ExactPlanner()
+        return OverFutures(planner, self.futures, seed * 1_000_003 + number, pattern, choose)
 
     def play(self, problem: Timed, number: int, seed: int) -> Played:
         """One mission."""
@@ -84,9 +88,7 @@ class Row:
         worlds = [World(problem) for problem in problems]
         deciders = [Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None)
                     for _ in problems]
-        planner, choose = self.planner, partial(planned, self.planner)
-        if isinstance(planner, PolicyPlanner) and planner.tries == 1 and planner.heat == 0.0:
-            choose = Pointing(planner.policy, planner.preference).choose
+        choose = pointing(self.planner) or partial(planned, self.planner)
         began = time.perf_counter()
         play_together(worlds, choose, deciders)
         each = (time.perf_counter() - began) / max(len(problems), 1)
@@ -133,9 +135,17 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
         for pattern in patterns or [""]:
             after = f", {pattern}" if pattern else ""
             found.append(Row(f"{one.name}{after}", one.planner, 0, pattern, together))
+            over = futures if not together or pointing(one.planner) is not None else ()
             found += [Row(f"{one.name} over {count} futures{after}", one.planner, count, pattern)
-                      for count in futures if not together]
+                      for count in over]
     return found
+
+
+def pointing(planner: TimedPlanner) -> Choose | None:
+    """A policy's likeliest choices of many moments in one call; None of other planners."""
+    if isinstance(planner, PolicyPlanner) and planner.tries == 1 and planner.heat == 0.0:
+        return Pointing(planner.policy, planner.preference).choose
+    return None
 
 
 def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: str, command: str,

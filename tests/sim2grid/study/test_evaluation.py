@@ -407,9 +407,12 @@ def test_on_the_engine_a_mission_does_not_depend_on_its_company():
 
 @pytest.mark.soak
 def test_both_engines_tell_the_same_of_many_missions(capsys):
-    """A small version of the 200 missions in docs/results.md: success and seconds agree."""
+    """The first of the 200 missions in docs/results/execution.md: success and seconds agree.
+
+    As many as it takes for the interval to be narrow: now and then a mission takes another course.
+    """
     words = ["evaluate", "execution", "--site", "highland", "--side", "8", "--targets", "3",
-             "--lose", "0.3", "--count", "20", "--planner", "exact", "--width", "20", "--json"]
+             "--lose", "0.3", "--count", "60", "--planner", "exact", "--width", "20", "--json"]
     assert main([*words, "--backend", "native", "mjx"]) == 0
     report = json.loads(capsys.readouterr().out)
     native, mjx = report["summary"]

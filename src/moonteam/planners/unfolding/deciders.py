@@ -11,7 +11,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from moonteam.planners.seconds.base import MS, Moment, TimedPlanner
+from moonteam.planners.seconds.base import MS, TimedPlanner
 from moonteam.planners.seconds.keeper import HOME, Keeper, choices
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.search import Pattern
@@ -23,6 +23,10 @@ OPTIONS = 6
 
 NOT_DONE = 2.0
 """Times its limit that an imagined mission counts which does not end well."""
+
+
+Choose = Callable[[list[View]], list[np.ndarray]]
+"""Of missions at an event [B], what everybody goes for, [N] each."""
 
 
 class Decider(Protocol):
@@ -77,17 +81,21 @@ class OverFutures:
       futures: how many are drawn.
       seed: of the draws.
       pattern: by which is looked for what is hidden.
+      choose: who decides otherwise, and goes on, in place of replanning; see `play_together`.
     """
 
     def __init__(self, planner: TimedPlanner, futures: int, seed: int = 0,
-                 pattern: Pattern | None = None):
+                 pattern: Pattern | None = None, choose: Choose | None = None):
         self._planner, self._count, self._pattern = planner, futures, pattern
-        self._rng = np.random.default_rng(seed)
+        self._rng, self._choose = np.random.default_rng(seed), choose
         self._base = Replanning(planner, pattern)
 
     def act(self, view: View) -> list[Order]:
         """See `Decider`."""
-        usual = self._base.act(view)
+        if self._choose is None or view.moment.solved.all():
+            usual = self._base.act(view)
+        else:
+            usual = self._base.settled(view, self._choose([view])[0])
         if not view.coming and view.expects.loss is None and not view.expects.scatter:
             return usual
         drawn = [future(view, self._rng) for _ in range(self._count)]
@@ -98,8 +106,9 @@ class OverFutures:
                 options.append(option)
         if len(options) == 1:
             return usual
-        costs = np.array([[self._played(one.world(view), option) for one in drawn]
-                          for option in options])
+        worlds = [one.world(view) for _ in options for one in drawn]
+        self._play(worlds, [option for option in options for _ in drawn])
+        costs = np.array([self._cost(world) for world in worlds]).reshape(len(options), -1)
         gain = costs[0] - costs
         best = int(gain.mean(1).argmax())
         error = float(gain[best].std(ddof=1)) / math.sqrt(self._count)
@@ -117,32 +126,41 @@ class OverFutures:
         chosen = choices(view.moment, [(one.target, one.agents) for one in plan.services])
         return [view.targets[j].at if j >= targets else int(j) for j in chosen.tolist()]
 
-    def _played(self, world: World, first: Sequence[Order]) -> float:
+    def _play(self, worlds: Sequence[World], first: Sequence[Sequence[Order]]) -> None:
+        """Imagined missions to their ends, from what everybody does first."""
+        for world, orders in zip(worlds, first, strict=True):
+            world.step(orders)
+        goes_on = [Replanning(self._planner, self._pattern) for _ in worlds]
+        if self._choose is not None:
+            play_together(worlds, self._choose, goes_on, OPTIONS * self._count)
+            return
+        for world, decider in zip(worlds, goes_on, strict=True):
+            while not world.over:
+                world.step(decider.act(world.view()))
+
+    def _cost(self, world: World) -> float:
         """s of an imagined mission, from its start."""
-        goes_on = Replanning(self._planner, self._pattern)
-        world.step(first)
-        while not world.over:
-            world.step(goes_on.act(world.view()))
         out = world.outcome
         return out.seconds if out.success else NOT_DONE * world.state.limit / MS
 
 
-def play_together(worlds: Sequence[World], choose: Callable[[list[Moment]], list[np.ndarray]],
-                  deciders: Sequence[Replanning]) -> None:
+def play_together(worlds: Sequence[World], choose: Choose, deciders: Sequence[Replanning],
+                  size: int = 0) -> None:
     """Plays missions [B] side by side to their ends.
 
     Args:
       worlds: [B].
-      choose: what everybody goes for, of several moments in one call, [N] each.
+      choose: what everybody goes for, of several missions in one call, [N] each.
       deciders: [B], for who looks for what is hidden.
+      size: missions of a call, filled up, lest it compile anew for every number; B if not given.
     """
+    size = size or len(worlds)
     left = [k for k, world in enumerate(worlds) if not world.over]
     while left:
         views = {k: worlds[k].view() for k in left}
         asked = [k for k in left if not views[k].moment.solved.all()]
-        moments = [views[k].moment for k in asked]
-        # Always as many, lest it compile anew for every number that is left.
-        found = choose(moments + moments[:1] * (len(worlds) - len(moments))) if asked else []
+        given = [views[k] for k in asked]
+        found = choose(given + given[:1] * (size - len(given))) if asked else []
         orders = {k: deciders[k].settled(views[k], chosen)
                   for k, chosen in zip(asked, found, strict=False)}
         for k in left:
@@ -150,10 +168,11 @@ def play_together(worlds: Sequence[World], choose: Callable[[list[Moment]], list
         left = [k for k in left if not worlds[k].over]
 
 
-def planned(planner: TimedPlanner, moments: list[Moment]) -> list[np.ndarray]:
+def planned(planner: TimedPlanner, views: list[View]) -> list[np.ndarray]:
     """[B] of [N]: what the plans of a planner that takes many moments (`plans`) have everybody do
     first.
     """
+    moments = [view.moment for view in views]
     plans = cast(Any, planner).plans(moments)
     return [choices(moment, [(one.target, one.agents) for one in plan.services])
             for moment, plan in zip(moments, plans, strict=True)]

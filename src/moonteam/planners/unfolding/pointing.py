@@ -6,6 +6,7 @@ Legend: B missions, N robots, M targets known of.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,9 +18,9 @@ from jax import Array
 from moonteam.grid.macro import world
 from moonteam.grid.macro.types import MacroProblem
 from moonteam.planners import macro
-from moonteam.planners.seconds.base import Moment
 from moonteam.planners.seconds.keeper import WAIT
 from moonteam.planners.seconds.macro import problem_of
+from moonteam.planners.unfolding.world import View
 from moonteam.policies import pointer
 from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.policy import Policy
@@ -28,28 +29,43 @@ from moonteam.policies.policy import Policy
 class Pointing:
     """What the network points at, one choice after the other, the surest first.
 
-    Raises InputError for a policy that does not point at targets.
+    Who waits at a target for others stays bound to it, as in the world that it was trained in; who
+    is on the way may turn. Raises InputError for a policy that does not point at targets.
     """
 
     def __init__(self, policy: Policy, preference: float = 0.0):
         self._spec, self._params = macro.spec_of(policy), policy.params
         self._preference = np.float32(preference)
 
-    def choose(self, moments: Sequence[Moment]) -> list[np.ndarray]:
-        """[B] of [N] int64: a target's number or WAIT, for who is free now."""
-        problems = macro.stacked([problem_of(moment) for moment in moments])
-        found = np.asarray(_point(self._spec, self._params, problems, self._preference))
+    def choose(self, views: Sequence[View]) -> list[np.ndarray]:
+        """[B] of [N] int64: a target's number or WAIT."""
+        problems = macro.stacked([problem_of(view.moment) for view in views])
+        bound = np.full(problems.free.shape, -1, np.int32)
+        for row, view in zip(bound, views, strict=True):
+            row[:len(view.places)] = _bound(view)
+        found = np.asarray(_point(self._spec, self._params, problems, bound, self._preference))
         chosen = []
-        for row, moment in zip(found, moments, strict=True):
-            own = row[:len(moment.present)].astype(np.int64)
-            chosen.append(np.where(own < len(moment.solved), own, WAIT))
+        for row, own, view in zip(found, bound, views, strict=True):
+            count, targets = len(view.places), len(view.targets)
+            free = np.where(row < targets, row, WAIT)
+            chosen.append(np.where(own >= 0, own, free)[:count].astype(np.int64))
         return chosen
 
 
+def _bound(view: View) -> list[int]:
+    """[N] the open target at which each robot waits; -1 of the others."""
+    return [body.goal if body.phase == "there" and isinstance(body.goal, int) and body.goal >= 0
+            and not view.moment.solved[body.goal] else -1 for body in view.state.bodies]
+
+
 @partial(jax.jit, static_argnames="spec")
-def _point(spec: PointerSpec, params: Any, problems: MacroProblem, preference: Array) -> Array:
-    """[B, N] int32 choices; M for waiting."""
+def _point(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
+           preference: Array) -> Array:
+    """[B, N] int32 choices; M for waiting, and of those `bound` [B, N] to a target already."""
     states = jax.vmap(world.reset)(problems)
+    held = (bound >= 0) & problems.agent_mask
+    goal, node = (jnp.where(held, bound, x) for x in (states.goal, states.node))
+    states = replace(states, goal=goal, node=node)
     liking = jnp.broadcast_to(preference, states.now.shape)
     logits = pointer.point(params, spec, jax.vmap(pointer.look)(states, liking)).logits
     choice, _ = jax.vmap(world.choose)(states, logits, jnp.zeros_like(logits))
