@@ -52,7 +52,8 @@ COLUMNS = (
     Column("effort", "s under way", lambda value: f"{value:.1f}"),
     Column("decisions", "decisions", lambda value: f"{value:.1f}"),
     Column("decision_seconds", "a decision takes", tables.duration))
-PAGE = COLUMNS
+PAGE = COLUMNS[:-1]
+"""Columns of the Markdown table: without the time, which depends on what else a machine does."""
 
 
 @dataclass(frozen=True)
