@@ -257,6 +257,7 @@ WRITERS = {
     "evaluate grid": ("evaluate grid 3x5", "rows.csv"),
     "evaluate sets": ("evaluate sets", "report.json"),
     "evaluate replanning": ("evaluate replanning", "replanning.png"),
+    "evaluate unfolding": ("evaluate unfolding", "unfolding.png"),
     "evaluate peers": ("evaluate peers", "peers.json"),
     "evaluate timing": ("evaluate timing", "timing.csv"),
     "evaluate preference": ("evaluate preference 3x5 --policy any_team", "preference.png"),
