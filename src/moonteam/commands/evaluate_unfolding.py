@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -65,8 +65,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     Default: theirs."""
 
 
-def _missions(args: Args) -> list[Timed]:
-    """Those of the set. Raises InputError."""
+def _missions(args: Args) -> tuple[list[Timed], bool]:
+    """Those of the set, and whether targets are hidden. Raises InputError."""
     found = [one for one in load_any(args.set, args.limit) if isinstance(one, Timed)]
     if not found:
         raise InputError(args.set, "is in steps; a set by the clock is needed, such as "
@@ -74,7 +74,7 @@ def _missions(args: Args) -> list[Timed]:
     hidden = any(target.hidden for one in found for target in one.targets)
     if args.search and not hidden:
         raise InputError("--search", "has no effect where no target is hidden")
-    return found
+    return found, hidden
 
 
 def run(args: Args) -> int:
@@ -83,11 +83,9 @@ def run(args: Args) -> int:
     from moonteam.evaluation import timed, unfolding
     from moonteam.report import command, journal
 
-    found = _missions(args)
-    hidden = any(target.hidden for one in found for target in one.targets)
+    found, hidden = _missions(args)
     patterns = args.search or tuple(unfolding.PATTERNS) if hidden else ()
-    options = replace(options_of(args), planners=args.planner or ("exact",))
-    rows = unfolding.rows_of(timed.contenders(options), args.futures, patterns)
+    rows = unfolding.rows_of(timed.contenders(options_of(args)), args.futures, patterns)
     kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
     title = f"{Path(args.set).stem}: {len(found)} missions that unfold"
     document = unfolding.evaluate(found, rows, args.seed, title,

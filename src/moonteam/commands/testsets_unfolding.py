@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import islice
 
-import msgspec
-
-from moonteam.problem.timed import Timed
+from moonteam.commands.testsets_seconds import certify, judged
+from moonteam.problem.timed import Known, Timed
 
 COUNT = 1000
 
@@ -34,12 +32,15 @@ def make(recipe: Recipe, count: int, seed: int, speeds: tuple[float, ...],
     """One set; `update(done, words)` is told about progress."""
     from moonteam.planners.unfolding import draw
 
-    found = []
-    for one in islice(draw.draws(recipe.family, seed, speeds), count):
-        found.append(msgspec.structs.replace(one, id=f"{recipe.name()}-{len(found):04d}"))
-        if len(found) % 20 == 0 or len(found) == count:
-            update(len(found), f"{len(found)} of {count}")
-    return found
+    return judged(recipe.name(), draw.draws(recipe.family, seed, speeds), bound, count, update)
+
+
+def bound(problem: Timed) -> Known | None:
+    """The least makespan in hindsight, all known from the start and nobody lost: nobody can be
+    faster. None where that is more than the limit.
+    """
+    known = certify(problem)
+    return None if known is None else Known(bound=known.makespan)
 
 
 def describe(recipe: Recipe, seed: int, speeds: tuple[float, ...], problems: list[Timed]) -> dict:

@@ -175,8 +175,8 @@ def _pointed(policy: Policy, session: Any, count: int, seed: int) -> Comparison:
     each = -(-count // len(FAMILIES))
     for family in track(FAMILIES, "comparing", len(FAMILIES)):
         for state, known, going in moments(policy, family, each, seed):
-            view = {f: np.asarray(getattr(known.view, f)) for f in known.view.__dataclass_fields__
-                    if f != "ahead"}
+            view = {one.name: np.asarray(getattr(known.view, one.name))
+                    for one in session.get_inputs()}
             said = session.run(["logits"], view)[0]
             free = np.asarray(known.free) & going[:, None]
             alike = np.asarray(_settle(state, jnp.asarray(said)) == known.choice)

@@ -6,6 +6,7 @@ replanning where it is among them, mission by mission.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from moonteam.planners.unfolding.deciders import (
     OverFutures,
     Replanning,
     planned,
+    play,
     play_together,
 )
 from moonteam.planners.unfolding.pointing import Pointing
@@ -60,18 +62,34 @@ PAGE = COLUMNS[:-1]
 class Row:
     """One row of the table."""
 
-    name: str
-    planner: TimedPlanner
+    contender: by_clock.Contender
     futures: int = 0
     pattern: str = ""
-    together: bool = False
-    """It decides in many missions in one call, as it says last."""
+
+    @property
+    def name(self) -> str:
+        """Such as exact(makespan) over 16 futures, nearest."""
+        over = f" over {self.futures} futures" if self.futures else ""
+        return f"{self.contender.name}{over}" + (f", {self.pattern}" if self.pattern else "")
+
+    @property
+    def planner(self) -> TimedPlanner:
+        """The contender's."""
+        return self.contender.planner
+
+    @property
+    def together(self) -> bool:
+        """Whether it decides in many missions in one call, as it says last."""
+        return self.contender.together and not self.futures
+
+    def _replanning(self) -> Replanning:
+        return Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None)
 
     def decider(self, number: int, seed: int) -> Decider:
         """Who decides in mission `number`."""
-        pattern = PATTERNS[self.pattern]() if self.pattern else None
         if not self.futures:
-            return Replanning(self.planner, pattern)
+            return self._replanning()
+        pattern = PATTERNS[self.pattern]() if self.pattern else None
         choose = pointing(self.planner)
         planner = self.planner if choose is None else ExactPlanner()
         return OverFutures(planner, self.futures, seed * 1_000_003 + number, pattern, choose)
@@ -80,15 +98,13 @@ class Row:
         """One mission."""
         world, decider = World(problem), self.decider(number, seed)
         began = time.perf_counter()
-        while not world.over:
-            world.step(decider.act(world.view()))
+        play(world, decider)
         return Played.of(problem, world.outcome, time.perf_counter() - began)
 
     def play_all(self, problems: Sequence[Timed]) -> list[Played]:
         """All missions, side by side."""
         worlds = [World(problem) for problem in problems]
-        deciders = [Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None)
-                    for _ in problems]
+        deciders = [self._replanning() for _ in problems]
         choose = pointing(self.planner) or partial(planned, self.planner)
         began = time.perf_counter()
         play_together(worlds, choose, deciders)
@@ -132,13 +148,9 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             raise InputError("--futures", f"{count} is not allowed; 2 to 4096")
     found = []
     for one in contenders:
-        together = callable(getattr(one.planner, "plans", None))
+        over = futures if not one.together or pointing(one.planner) is not None else ()
         for pattern in patterns or [""]:
-            after = f", {pattern}" if pattern else ""
-            found.append(Row(f"{one.name}{after}", one.planner, 0, pattern, together))
-            over = futures if not together or pointing(one.planner) is not None else ()
-            found += [Row(f"{one.name} over {count} futures{after}", one.planner, count, pattern)
-                      for count in over]
+            found += [Row(one, count, pattern) for count in (0, *over)]
     return found
 
 
@@ -152,7 +164,7 @@ def pointing(planner: TimedPlanner) -> Choose | None:
 def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: str, command: str,
              kept: Kept = NOTHING) -> dict:
     """The report; interrupted, of the rows that are done. Raises InputError, nothing run yet."""
-    _check(problems, rows)
+    by_clock.check(problems, [row.contender for row in rows])
     found: list[tuple[Row, list[Played]]] = []
     try:
         for row in rows:
@@ -209,16 +221,6 @@ def _played(problems: Sequence[Timed], row: Row, seed: int, kept: Kept) -> list[
             for i in track(range(len(problems)), row.name, len(problems))]
 
 
-def _check(problems: Sequence[Timed], rows: Sequence[Row]) -> None:
-    """Raises InputError for a planner that does not take so many targets."""
-    largest = max(problems, key=lambda problem: len(problem.targets))
-    for row in rows:
-        most = getattr(row.planner, "most_targets", None)
-        if most is not None and len(largest.targets) > most:
-            raise InputError(f"--planner {row.name}", f"takes at most {most} targets; "
-                             f"{largest.id or 'a mission'} has {len(largest.targets)}")
-
-
 def _causes(found: Sequence[tuple[Row, list[Played]]]) -> list[str]:
     """A line for each row with failures: why, and how often."""
     lines = []
@@ -226,8 +228,7 @@ def _causes(found: Sequence[tuple[Row, list[Played]]]) -> list[str]:
         counts: dict[str, int] = {}
         for one in played:
             if not one.success:
-                words = one.reason.rstrip("0123456789").strip() if "target" in one.reason \
-                    else one.reason
+                words = re.sub(r"target \d+", "target", one.reason)
                 counts[words] = counts.get(words, 0) + 1
         if counts:
             lines.append(f"{row.name}: " + "; ".join(

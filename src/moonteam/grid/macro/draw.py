@@ -6,7 +6,7 @@ Legend as in `types`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -167,10 +167,14 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
     return replace(made, middle=mean(problem.target_cells), middle_now=mean(cells))
 
 
-def places(low: Array, high: Array, along: int = 8) -> Array:
-    """[P, 2] of a rectangle, evenly: the middles of `along` times `along` parts."""
-    share = (jnp.arange(along) + 0.5) / along
-    grid = jnp.stack(jnp.meshgrid(share, share), axis=-1).reshape(-1, 2)
+def places(low: Any, high: Any, along: int = 8) -> Any:
+    """[P, 2] of a rectangle, evenly: the middles of `along` times `along` parts.
+
+    Of NumPy's arrays or JAX's, `low` and `high` [2].
+    """
+    xp = low.__array_namespace__()
+    share = (xp.arange(along) + 0.5) / along
+    grid = xp.stack(xp.meshgrid(share, share), axis=-1).reshape(-1, 2)
     return low[None] + grid * (high - low)[None]
 
 

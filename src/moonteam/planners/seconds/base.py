@@ -115,10 +115,24 @@ class TimedPlanner(Protocol):
         ...
 
 
-def moment(timed: Timed) -> Moment:
-    """A scenario's first moment: every way by its metric and each agent's speed."""
-    names = timed.skill_names
+def opens(target: Target) -> int:
+    """ms before which its service does not start."""
+    return math.ceil(MS * target.appears - 1e-6)
+
+
+def closes(target: Target) -> int:
+    """ms after which its service does not start; NEVER where it does not lapse."""
+    return NEVER if target.lapses is None else math.floor(MS * target.lapses + 1e-6)
+
+
+def moment(timed: Timed, skills: Sequence[str] | None = None) -> Moment:
+    """A scenario's first moment: every way by its metric and each agent's speed.
+
+    `skills` are the columns [S] of `has` and `need`; the scenario's own if not given.
+    """
+    names = timed.skill_names if skills is None else skills
     agents, targets = timed.agents, timed.targets
+    count = len(targets)
     speeds = sorted({agent.speed for agent in agents})
 
     def ms(a: tuple[float, float], b: tuple[float, float], speed: float) -> int:
@@ -131,20 +145,20 @@ def moment(timed: Timed) -> Moment:
     return Moment(
         start=np.array([[ms(a.at, t.at, a.speed) for t in targets] for a in agents], np.int64),
         between=np.array([[[ms(t.at, u.at, v) for u in targets] for t in targets]
-                          for v in speeds], np.int64),
+                          for v in speeds], np.int64).reshape(len(speeds), count, count),
         home=np.array([[0 if a.home is None else ms(t.at, a.home, a.speed) for t in targets]
                        for a in agents], np.int64),
         home_now=np.array([0 if a.home is None else ms(a.at, a.home, a.speed) for a in agents],
                           np.int64),
         classes=np.array([speeds.index(a.speed) for a in agents], np.int64),
         has=np.array([[s in a.skills for s in names] for a in agents], bool),
-        need=np.array([[need.get(s, 0) for s in names] for need in needs], np.int64),
+        need=np.array([[need.get(s, 0) for s in names] for need in needs], np.int64).reshape(
+            count, len(names)),
         either=np.array([t.type == "OR" and not t.coalition for t in targets], bool),
         service=np.array([round(MS * t.service) for t in targets], np.int64),
         after=after,
-        appears=np.array([math.ceil(MS * t.appears - 1e-6) for t in targets], np.int64),
-        lapses=np.array([NEVER if t.lapses is None else math.floor(MS * t.lapses + 1e-6)
-                         for t in targets], np.int64),
+        appears=np.array([opens(t) for t in targets], np.int64),
+        lapses=np.array([closes(t) for t in targets], np.int64),
         free=np.zeros(len(agents), np.int64),
         present=np.ones(len(agents), bool),
         solved=np.zeros(len(targets), bool),

@@ -51,7 +51,7 @@ class Keeper:
             kept is None or makespan(moment, self.plan.services)
             < makespan(moment, kept) - self._margin)
         if better:
-            self._order = [(one.target, one.agents) for one in self.plan.services]
+            self._order = order_of(self.plan)
         elif kept is None:
             self._order = []
         return choices(moment, self._order)
@@ -59,6 +59,11 @@ class Keeper:
     def expected(self, moment: Moment) -> tuple[Service, ...] | None:
         """The plan that is kept, as it would go from this moment."""
         return timed_again(moment, self._order)
+
+
+def order_of(plan: TimedPlan) -> list[tuple[int, tuple[int, ...]]]:
+    """Its targets with their teams, in order of start."""
+    return [(one.target, one.agents) for one in plan.services]
 
 
 def choices(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]

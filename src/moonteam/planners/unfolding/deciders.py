@@ -12,7 +12,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from moonteam.planners.seconds.base import MS, TimedPlanner
-from moonteam.planners.seconds.keeper import HOME, Keeper, choices
+from moonteam.planners.seconds.keeper import HOME, Keeper, choices, order_of
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.search import Pattern
 from moonteam.planners.unfolding.state import Order
@@ -123,7 +123,7 @@ class OverFutures:
         plan = self._planner.plan(view.moment)
         if plan.status == "infeasible":
             return None
-        chosen = choices(view.moment, [(one.target, one.agents) for one in plan.services])
+        chosen = choices(view.moment, order_of(plan))
         return [view.targets[j].at if j >= targets else int(j) for j in chosen.tolist()]
 
     def _play(self, worlds: Sequence[World], first: Sequence[Sequence[Order]]) -> None:
@@ -135,13 +135,18 @@ class OverFutures:
             play_together(worlds, self._choose, goes_on, OPTIONS * self._count)
             return
         for world, decider in zip(worlds, goes_on, strict=True):
-            while not world.over:
-                world.step(decider.act(world.view()))
+            play(world, decider)
 
     def _cost(self, world: World) -> float:
         """s of an imagined mission, from its start."""
         out = world.outcome
         return out.seconds if out.success else NOT_DONE * world.state.limit / MS
+
+
+def play(world: World, decider: Decider) -> None:
+    """Plays a mission to its end."""
+    while not world.over:
+        world.step(decider.act(world.view()))
 
 
 def play_together(worlds: Sequence[World], choose: Choose, deciders: Sequence[Replanning],
@@ -174,5 +179,4 @@ def planned(planner: TimedPlanner, views: list[View]) -> list[np.ndarray]:
     """
     moments = [view.moment for view in views]
     plans = cast(Any, planner).plans(moments)
-    return [choices(moment, [(one.target, one.agents) for one in plan.services])
-            for moment, plan in zip(moments, plans, strict=True)]
+    return [choices(moment, order_of(plan)) for moment, plan in zip(moments, plans, strict=True)]

@@ -16,10 +16,8 @@ import msgspec
 import numpy as np
 
 from moonteam.grid.scenarios import generate
-from moonteam.planners.seconds.base import MS, moment
-from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.problem import timed
-from moonteam.problem.timed import Known, Loss, Prospect, Timed
+from moonteam.problem.timed import Loss, Prospect, Timed
 
 AREA = (0.0, 0.0, 31.0, 31.0)
 EVERY_S, SENSOR_M = 10.0, 6.0
@@ -45,15 +43,13 @@ FAMILIES = {
 
 
 def draws(name: str, seed: int, speeds: tuple[float, ...]) -> Iterator[Timed]:
-    """Endless missions of a family, which can be solved in hindsight.
+    """Endless missions of a family, not yet checked for time.
 
     Each robot draws one of the speeds, m/s, but in `following`.
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     while True:
-        made = _with_bound(_draw(name, rng, speeds))
-        if made is not None:
-            yield made
+        yield _draw(name, rng, speeds)
 
 
 def _draw(name: str, rng: np.random.Generator, speeds: tuple[float, ...]) -> Timed:
@@ -80,14 +76,3 @@ def _draw(name: str, rng: np.random.Generator, speeds: tuple[float, ...]) -> Tim
     return change(known, metric="manhattan" if name == "following" else "straight",
                   max_seconds=family.limit_s, agents=tuple(agents), targets=tuple(targets),
                   expects=family.expects)
-
-
-def _with_bound(problem: Timed) -> Timed | None:
-    """With the least makespan in hindsight, all known from the start and nobody lost.
-
-    Nobody can be faster. None where that is more than the limit.
-    """
-    plan = ExactPlanner("makespan").plan(moment(problem))
-    if plan.status != "optimal" or plan.makespan is None:
-        return None
-    return msgspec.structs.replace(problem, optimal=Known(bound=plan.makespan / MS))

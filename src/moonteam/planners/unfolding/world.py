@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from moonteam.planners.seconds.base import MS, NEVER, Moment, enough
+from moonteam.planners.seconds.base import MS, NEVER, Moment, closes, enough, opens
 from moonteam.planners.seconds.keeper import HOME, WAIT
 from moonteam.planners.unfolding.ground import Ground
-from moonteam.planners.unfolding.state import Body, Order, Outcome, State, appears, lapses
+from moonteam.planners.unfolding.state import Body, Order, Outcome, State
 from moonteam.planners.unfolding.ways import Floats, Way
 from moonteam.problem.timed import Agent, Place, Prospect, Target, Timed
 
@@ -185,13 +185,13 @@ class World:
                 found.append(body.until)
             if body.phase != "lost" and lost is not None:
                 found.append(max(now, math.ceil(MS * lost)))
-        found += [max(now, appears(target)) for _, target in self._coming
+        found += [max(now, opens(target)) for _, target in self._coming
                   if target.appears and not target.hidden and self._after_known(target)]
         for target, served in zip(state.targets, state.served_at, strict=True):
-            if served < 0 and appears(target) > now:
-                found.append(appears(target))
+            if served < 0 and opens(target) > now:
+                found.append(opens(target))
             if served < 0 and target.lapses is not None:
-                found.append(max(now, lapses(target) + 1))
+                found.append(max(now, closes(target) + 1))
         return min(*found, self._found_at(min(found)), NEVER)
 
     def _found_at(self, until: int) -> int:
@@ -283,7 +283,7 @@ class World:
         return self._know([
             (k, target) for k, target in self._coming
             if not target.hidden and target.following <= count
-            and appears(target) <= self.state.now and self._after_known(target)])
+            and opens(target) <= self.state.now and self._after_known(target)])
 
     def _after_known(self, target: Target) -> bool:
         """Whether everything before it is known of: it is not known of earlier."""
@@ -299,10 +299,10 @@ class World:
     def _start_services(self) -> bool:
         state, some = self.state, False
         for j, target in enumerate(state.targets):
-            if state.served_at[j] >= 0 or not appears(target) <= state.now <= lapses(target):
+            if state.served_at[j] >= 0 or not opens(target) <= state.now <= closes(target):
                 continue
             team = [i for i, b in enumerate(state.bodies) if b.phase == "there" and b.goal == j]
-            if not team or not enough(team, j, state.table) or not all(
+            if not team or not enough(team, j, state.known) or not all(
                     0 <= state.ends[state.numbers.index(k)] <= state.now for k in target.after):
                 continue
             state.served_at[j] = state.now
@@ -322,10 +322,10 @@ class World:
                 self._end("")
             return
         for j in [j for j, served in enumerate(state.served_at) if served < 0]:
-            if state.now > lapses(state.targets[j]):
+            if state.now > closes(state.targets[j]):
                 self._end(f"target {state.numbers[j]} lapsed")
                 return
-            if not enough(team, j, state.table):
+            if not enough(team, j, state.known):
                 self._end(f"the robots that are left cannot serve target {state.numbers[j]}")
                 return
 
@@ -336,9 +336,8 @@ class World:
             if body.phase != "lost":
                 self._stop(i, state.place(i))
         out.success, out.reason, out.seconds = not reason, reason, state.now / MS
-        out.solved = len(out.solves)
         waits = [(served if served >= 0 else state.now)
-                 - (0 if target.hidden else max(known, appears(target)))
+                 - (0 if target.hidden else max(known, opens(target)))
                  for served, known, target in zip(state.served_at, state.known_at, state.targets,
                                                   strict=True)]
         waits += [state.now for _, target in self._coming if target.hidden]
