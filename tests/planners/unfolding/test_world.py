@@ -216,6 +216,15 @@ def test_choosing_over_futures_is_the_same_with_the_same_seed():
     assert played_twice[0] == played_twice[1]
 
 
+def test_what_is_imagined_does_not_move_the_sweep_on():
+    pattern = Sweep()
+    decider = OverFutures(GreedyPlanner(), 2, 5, pattern)
+    view = World(missions("hidden", 1)[0]).view()
+    before = pattern.look(view, range(3))
+    decider.act(view)
+    assert pattern.look(view, range(3)) == before
+
+
 def test_choosing_over_futures_waits_for_what_is_sure_to_come():
     """A robot without a target goes to where one has to appear, replanning stands still."""
     problem = mission(

@@ -5,6 +5,7 @@ Legend: N robots, M targets known of, B missions.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, cast
@@ -130,7 +131,8 @@ class OverFutures:
         """Imagined missions to their ends, from what everybody does first."""
         for world, orders in zip(worlds, first, strict=True):
             world.step(orders)
-        goes_on = [Replanning(self._planner, self._pattern) for _ in worlds]
+        # What a pattern remembers of the mission is its own in each of them.
+        goes_on = [Replanning(self._planner, copy.deepcopy(self._pattern)) for _ in worlds]
         if self._choose is not None:
             play_together(worlds, self._choose, goes_on, OPTIONS * self._count)
             return
