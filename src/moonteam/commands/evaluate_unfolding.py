@@ -18,6 +18,7 @@ FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", 
          "unfolding.png")
 """In --out."""
 Search = Literal["nearest", "sweep"]
+Goal = Literal["makespan", "waiting"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     Examples:
       moonteam evaluate unfolding unfolding/following --planner exact --planner greedy
       moonteam evaluate unfolding unfolding/arrivals --futures 16 --limit 100
+      moonteam evaluate unfolding --planner policy --policy unfolding --futures 256 --limit 200
+      moonteam evaluate unfolding unfolding/arrivals --futures 64 --goal waiting --limit 100
       moonteam evaluate unfolding unfolding/hidden --search nearest --search sweep
       moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team_mappo
     """
@@ -52,7 +55,10 @@ class Args(Seeded, Limited, Resumable, Reported):
     for more rows. Default: exact."""
     futures: Many[tuple[int, ...]] = ()
     """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
-    themselves in the futures."""
+    themselves in the futures; where nothing but targets comes, thousands of them in one call."""
+    goal: Many[tuple[Goal, ...]] = ()
+    """What is to be least over futures: makespan, or waiting, which is how long targets wait for
+    their services; again for more rows. Default: makespan."""
     search: Many[tuple[Search, ...]] = ()
     """Where targets are hidden: nearest or sweep; again for more rows. Default: both."""
     policy: Many[tuple[str, ...]] = ()
@@ -65,8 +71,11 @@ class Args(Seeded, Limited, Resumable, Reported):
     Default: theirs."""
 
 
-def _missions(args: Args) -> tuple[list[Timed], bool]:
-    """Those of the set, and whether targets are hidden. Raises InputError."""
+def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
+    """Those of the set, whether targets are hidden, and whether nothing but targets comes.
+
+    Raises InputError.
+    """
     found = [one for one in load_any(args.set, args.limit) if isinstance(one, Timed)]
     if not found:
         raise InputError(args.set, "is in steps; a set by the clock is needed, such as "
@@ -74,7 +83,11 @@ def _missions(args: Args) -> tuple[list[Timed], bool]:
     hidden = any(target.hidden for one in found for target in one.targets)
     if args.search and not hidden:
         raise InputError("--search", "has no effect where no target is hidden")
-    return found, hidden
+    if args.goal and not args.futures:
+        raise InputError("--goal", "has no effect without --futures")
+    others = any(one.expects is not None and (one.expects.loss is not None or one.expects.scatter)
+                 for one in found)
+    return found, hidden, not (hidden or others)
 
 
 def run(args: Args) -> int:
@@ -83,9 +96,10 @@ def run(args: Args) -> int:
     from moonteam.evaluation import timed, unfolding
     from moonteam.report import command, journal
 
-    found, hidden = _missions(args)
+    found, hidden, ahead = _missions(args)
     patterns = args.search or tuple(unfolding.PATTERNS) if hidden else ()
-    rows = unfolding.rows_of(timed.contenders(options_of(args)), args.futures, patterns)
+    rows = unfolding.rows_of(timed.contenders(options_of(args)), args.futures, patterns, args.goal,
+                             ahead)
     kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
     title = f"{Path(args.set).stem}: {len(found)} missions that unfold"
     document = unfolding.evaluate(found, rows, args.seed, title,

@@ -20,9 +20,12 @@ from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import TimedPlanner
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.policy import PolicyPlanner
+from moonteam.planners.unfolding.ahead import LookingAhead
 from moonteam.planners.unfolding.deciders import (
+    GOALS,
     Choose,
     Decider,
+    Goal,
     OverFutures,
     Replanning,
     planned,
@@ -65,12 +68,16 @@ class Row:
     contender: by_clock.Contender
     futures: int = 0
     pattern: str = ""
+    goal: Goal = "makespan"
+    ahead: bool = False
+    """A policy that looks ahead in the macro world."""
 
     @property
     def name(self) -> str:
-        """Such as exact(makespan) over 16 futures, nearest."""
+        """Such as exact(makespan) over 16 futures, nearest; or ... over 16 futures, waiting."""
         over = f" over {self.futures} futures" if self.futures else ""
-        return f"{self.contender.name}{over}" + (f", {self.pattern}" if self.pattern else "")
+        aims = f", {self.goal}" if self.futures and self.goal != GOALS[0] else ""
+        return f"{self.contender.name}{over}{aims}" + (f", {self.pattern}" if self.pattern else "")
 
     @property
     def planner(self) -> TimedPlanner:
@@ -80,7 +87,7 @@ class Row:
     @property
     def together(self) -> bool:
         """Whether it decides in many missions in one call, as it says last."""
-        return self.contender.together and not self.futures
+        return self.ahead or (self.contender.together and not self.futures)
 
     def _replanning(self) -> Replanning:
         return Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None)
@@ -92,7 +99,8 @@ class Row:
         pattern = PATTERNS[self.pattern]() if self.pattern else None
         choose = pointing(self.planner)
         planner = self.planner if choose is None else ExactPlanner()
-        return OverFutures(planner, self.futures, seed * 1_000_003 + number, pattern, choose)
+        return OverFutures(planner, self.futures, seed * 1_000_003 + number, pattern, choose,
+                           self.goal)
 
     def play(self, problem: Timed, number: int, seed: int) -> Played:
         """One mission."""
@@ -101,11 +109,18 @@ class Row:
         play(world, decider)
         return Played.of(problem, world.outcome, time.perf_counter() - began)
 
-    def play_all(self, problems: Sequence[Timed]) -> list[Played]:
+    def _choose(self, seed: int) -> Choose:
+        """Who decides in many missions in one call."""
+        if not isinstance(self.planner, PolicyPlanner) or not self.ahead:
+            return pointing(self.planner) or partial(planned, self.planner)
+        return LookingAhead(self.planner.policy, self.futures, self.goal, seed,
+                            self.planner.preference).choose
+
+    def play_all(self, problems: Sequence[Timed], seed: int) -> list[Played]:
         """All missions, side by side."""
         worlds = [World(problem) for problem in problems]
         deciders = [self._replanning() for _ in problems]
-        choose = pointing(self.planner) or partial(planned, self.planner)
+        choose = self._choose(seed)
         began = time.perf_counter()
         play_together(worlds, choose, deciders)
         each = (time.perf_counter() - began) / max(len(problems), 1)
@@ -138,8 +153,10 @@ class Played:
 
 
 def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
-            patterns: Sequence[str]) -> list[Row]:
+            patterns: Sequence[str], goals: Sequence[Goal] = (), ahead: bool = False) -> list[Row]:
     """Every planner alone, then over so many futures, by every pattern of search.
+
+    `ahead`: nothing but targets comes, so that policies can look ahead in the macro world.
 
     Raises InputError for a number of futures that is none.
     """
@@ -148,9 +165,12 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             raise InputError("--futures", f"{count} is not allowed; 2 to 4096")
     found = []
     for one in contenders:
-        over = futures if not one.together or pointing(one.planner) is not None else ()
+        points = pointing(one.planner) is not None
+        over = futures if not one.together or points else ()
         for pattern in patterns or [""]:
-            found += [Row(one, count, pattern) for count in (0, *over)]
+            found += [Row(one, 0, pattern)]
+            found += [Row(one, count, pattern, goal, ahead and points)
+                      for count in over for goal in goals or GOALS[:1]]
     return found
 
 
@@ -216,7 +236,7 @@ def summary(row: Row, played: Sequence[Played], first: Sequence[Played], bound: 
 
 def _played(problems: Sequence[Timed], row: Row, seed: int, kept: Kept) -> list[Played]:
     if row.together:
-        return kept.once(("all",), list[Played], lambda: row.play_all(problems))
+        return kept.once(("all",), list[Played], lambda: row.play_all(problems, seed))
     return [kept.once((str(i),), Played, lambda i=i: row.play(problems[i], i, seed))
             for i in track(range(len(problems)), row.name, len(problems))]
 

@@ -73,7 +73,8 @@ class Outlook:
     after: Array  # [B, M, M] bool, after[j, k]: j waits for k
     home: Array  # [B, N, M] time from the target home
     preference: Array  # [B] 0 time .. 1 effort
-    ahead: Array | None = None  # [B, E, 3] log of how many come, time to where, and both at once
+    ahead: Array | None = None
+    """[B, E, 3] log of how many come (0 of places to look from), time to where, both at once."""
 
 
 def look(state: MacroState, preference: Array) -> Outlook:
@@ -133,10 +134,12 @@ def _ahead(state: MacroState) -> Array:
     """[E, 3] what of the future concerns each token; all 0 where nothing more comes."""
     p = state.problem
     count = jnp.log1p(world.coming(state).astype(jnp.float32))
+    looks = jnp.concatenate([jnp.zeros_like(p.agent_mask), p.looks])
     agents = jnp.where(p.agent_mask, world.middle_of(state, state.node), 0.0)
     far = jnp.concatenate([agents, jnp.where(p.target_mask, p.middle, 0.0)]) / p.unit
     far = jnp.where(count > 0, jnp.minimum(far, LONG), 0.0)
-    return jnp.stack([jnp.broadcast_to(count, far.shape), far, count * far], axis=-1)
+    count = jnp.where(looks, 0.0, count)  # by which places to look from are told from targets
+    return jnp.stack([count, far, count * far], axis=-1)
 
 
 def _token_features(view: Outlook) -> tuple[Array, Array]:

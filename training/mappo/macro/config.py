@@ -105,7 +105,7 @@ class MacroConfig:
 
     def grown(self, family: Practice) -> Vine:
         """Of a family: fewer moments of large problems, in fewer minibatches of the same size."""
-        vine, most = self.vine, family.draw.targets[1]
+        vine, most = self.vine, family.draw.entries
         steps = vine.num_steps or 2 * most
         # As many decisions as the paper's team would take, in episodes of this length.
         episodes = vine.episodes // family.shrink * (vine.num_steps or 14) // steps
@@ -169,5 +169,12 @@ PRESETS = {
                           arriving=5, every=10.0, limit=300.0)),
         ),
         # What comes makes returns noisy: a branch may move the policy less.
+        rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
+    "searching": MacroConfig(
+        "searching", (
+            Practice("5 hidden targets", Draw(
+                targets=(5, 5), metric="straight", speeds=(1.5, 0.36, 0.47), looks=4,
+                limit=600.0), shrink=2),
+        ),
         rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
 }

@@ -101,6 +101,11 @@ def turned(result: MacroResult, who: Array) -> tuple[MacroState, Array]:
     return after, result.effort - jnp.where(result.terminated, 0.0, jnp.sum(left, axis=-1))
 
 
+def left(states: MacroState) -> Array:
+    """[E] targets that are not solved."""
+    return jnp.sum(~states.solved & ~states.problem.looks, axis=-1)
+
+
 def price(hyper: Hyper, preference: Array, result: MacroResult, effort: Array,
           unit: Array) -> Array:
     """[E] what decisions cost, in units."""
@@ -132,7 +137,7 @@ def collect(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem 
         states, effort = turned(result, who)
         reward = -price(hyper, walk.preference, result, effort, walk.states.problem.unit)
         reward = reward - hyper.failure * jnp.where(
-            result.truncated, jnp.sum(~result.state.solved, axis=-1), 0)
+            result.truncated, left(result.state), 0)
         ended = result.terminated | result.truncated
         # Fresh episodes come from a pool, each environment's from another place at each step.
         new = jax.tree.map(lambda x: jnp.roll(x, t, axis=0), pool)

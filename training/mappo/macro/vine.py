@@ -30,7 +30,7 @@ from moonteam.planners.macro import refilled
 from moonteam.policies.pointer import Outlook, PointerSpec, look, point
 from training.mappo.macro.hyper import Hyper, Vine
 from training.mappo.macro.learner import AXIS, Learner, descend, say
-from training.mappo.macro.update import among, fresh, price, turned
+from training.mappo.macro.update import among, fresh, left, price, turned
 
 
 class Moments(NamedTuple):
@@ -150,9 +150,9 @@ def tried(spec: PointerSpec, hyper: Hyper, vine: Vine, params: Any, moments: Mom
         result = jax.vmap(world.step)(pool.states, choice)
         after, effort = turned(result, jnp.ones(choice.shape, bool))
         ended = result.terminated | result.truncated | (pool.turn + 1 >= vine.longest)
-        left = jnp.where(ended, jnp.sum(~result.state.solved, axis=-1), 0)
+        undone = jnp.where(ended, left(result.state), 0)
         paid = price(hyper, liking, result, effort, pool.states.problem.unit)
-        total = pool.sum - paid - hyper.failure * left
+        total = pool.sum - paid - hyper.failure * undone
         over = ended & (pool.branch < count)
         put = jnp.where(over, spot, size * k)
         branch, following = refilled(over, pool.branch, pool.following)

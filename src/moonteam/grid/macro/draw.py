@@ -113,11 +113,20 @@ class Draw:
     """Targets, the last of a problem, that nobody knows of before their time."""
     every: float = 10.0
     """Mean s between such times."""
+    looks: int = 0
+    """Where every target is hidden: places from which robots look, so many along either side."""
+    sensor: float = 6.0
+    """Cells that every robot sees there."""
 
     @property
     def unfolds(self) -> bool:
         """Whether not everything is known from the start."""
-        return bool(self.following or self.arriving)
+        return bool(self.following or self.arriving or self.looks)
+
+    @property
+    def entries(self) -> int:
+        """M, the most targets and all places to look from."""
+        return self.targets[1] + self.looks**2
 
     @property
     def config(self) -> EnvConfig:
@@ -133,18 +142,33 @@ def draw(family: Draw, key: Array) -> MacroProblem:
     number = jax.random.randint(team, (), family.agents[0], family.agents[1] + 1)
     side = jax.random.randint(size, (), family.sides[0], family.sides[1] + 1)
     problem, cells = sample(family.config, pose, number, count, jnp.stack([side, side]))
-    speed = paces(family, pace)
+    speed, skills = paces(family, pace), family.num_skills
+    if family.looks:
+        problem, skills = looked_for(family, problem), skills + 1
     if family.metric == "either":
-        made = [of_grid(problem, cells, family.limit, metric, speed, family.num_skills)
+        made = [of_grid(problem, cells, family.limit, metric, speed, skills)
                 for metric in ("manhattan", "straight")]
         straight = jax.random.bernoulli(ways)
         made = jax.tree.map(lambda a, b: jnp.where(straight, b, a), *made)
     else:
-        made = of_grid(problem, cells, family.limit, family.metric, speed, family.num_skills)
+        made = of_grid(problem, cells, family.limit, family.metric, speed, skills)
     made = asking(family, made, more)
     if family.unfolds:
         made = unfolding(family, made, problem, cells, speed, jax.random.fold_in(more, 1))
     return trees.single(made)
+
+
+def looked_for(family: Draw, problem: Problem) -> Problem:
+    """The problem with the places to look from after its targets, and eyes as one more skill."""
+    spots = places(jnp.zeros(2), problem.size - 1.0, family.looks)
+    count, eyes = len(spots), 1 << family.num_skills
+    join = lambda a, b: jnp.concatenate([a, jnp.broadcast_to(b, (count, *a.shape[1:]))])
+    return replace(
+        problem, agent_skills=problem.agent_skills | eyes,
+        target_cells=jnp.concatenate([problem.target_cells.astype(jnp.float32), spots]),
+        target_skills=join(problem.target_skills, jnp.int32(eyes)),
+        target_and=join(problem.target_and, jnp.array(True)),
+        target_mask=join(problem.target_mask, jnp.array(True)))
 
 
 def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, speed: Array,
@@ -154,7 +178,9 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
     count = jnp.sum(made.target_mask)
     turn = jnp.arange(targets) - (count - max(family.following, family.arriving)) + 1
     late = made.target_mask & (turn > 0)
-    if family.following:
+    if family.looks:
+        made = hidden(family, made, problem, cells)
+    elif family.following:
         made = replace(made, following=jnp.where(late, turn, 0).astype(jnp.int32))
     else:
         gaps = family.every * jax.random.exponential(key, (targets,))
@@ -165,6 +191,16 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
     spots = places(jnp.zeros(2), problem.size - 1.0)
     mean = lambda at: jnp.mean(apart(at, spots, metric), axis=1) / fastest
     return replace(made, middle=mean(problem.target_cells), middle_now=mean(cells))
+
+
+def hidden(family: Draw, made: MacroProblem, problem: Problem, cells: Array) -> MacroProblem:
+    """The problem, its targets to be seen from places to look from; those in sight are known."""
+    looks = jnp.arange(family.entries) >= family.targets[1]
+    far = apart(problem.target_cells, problem.target_cells, "straight")
+    sight = (far <= family.sensor) & looks[None] & ~looks[:, None] & made.target_mask[:, None]
+    seen = jnp.any((apart(cells, problem.target_cells, "straight") <= family.sensor)
+                   & made.agent_mask[:, None], axis=0)
+    return replace(made, looks=looks, sight=sight & ~seen[:, None])
 
 
 def places(low: Any, high: Any, along: int = 8) -> Any:

@@ -37,6 +37,8 @@ class MacroProblem:
     appears: Array  # [M] s before which j does not start
     shown: Array  # [M] s before which nobody knows of j
     following: Array  # [M] int32, targets that are solved before anybody knows of j
+    sight: Array  # [M, M] bool, sight[j, k]: j is hidden, and seen from k once k is solved
+    looks: Array  # [M] bool, places to look from, of use until all that is hidden has been seen
     coming: Array  # [] int32, targets still to be known of that have no entry here
     middle: Array  # [M] s from j to where targets may come, in the mean; 0 where nobody can say
     middle_now: Array  # [N] the same from where each agent starts
@@ -59,7 +61,8 @@ def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: 
         start=start, between=between, home=xp.zeros((agents, targets), xp.float32),
         home_now=nobody, has=has, need=need, either=either, service=none,
         after=xp.zeros((targets, targets), bool), appears=none, shown=none,
-        following=xp.zeros(targets, xp.int32), coming=xp.zeros((), xp.int32), middle=none,
+        following=xp.zeros(targets, xp.int32), sight=xp.zeros((targets, targets), bool),
+        looks=xp.zeros(targets, bool), coming=xp.zeros((), xp.int32), middle=none,
         middle_now=nobody,
         lapses=none + xp.float32(FAR), free=nobody, effort=nobody + 1, limit=limit,
         agent_mask=agent_mask, target_mask=target_mask, unit=unit)
@@ -84,6 +87,7 @@ class MacroState:
     solved: Array  # [M] bool; padded targets count as solved
     since: Array  # [N] s, when it last became free
     travelled: Array  # [N] s
+    begun: Array  # [] s at which services started, added up
 
 
 @jax.tree_util.register_dataclass
@@ -94,5 +98,5 @@ class MacroResult:
     state: MacroState
     seconds: Array  # [] s that passed; at the end, until everybody with a home is there too
     effort: Array  # [] weighted s of travel set out on, at the end with the ways home
-    terminated: Array  # [] bool, every target is solved
+    terminated: Array  # [] bool, every target is solved, whatever has been looked at
     truncated: Array  # [] bool, the limit was passed, or nothing can happen any more

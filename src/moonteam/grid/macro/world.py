@@ -33,7 +33,8 @@ def reset(problem: MacroProblem) -> MacroState:
     start = MacroState(
         problem=problem, now=jnp.zeros((), jnp.float32), node=none, origin=none, leg=zero,
         goal=none, busy=problem.free, serving=jnp.zeros(targets, bool),
-        solved=~problem.target_mask, since=problem.free, travelled=zero)
+        solved=~problem.target_mask, since=problem.free, travelled=zero,
+        begun=jnp.zeros((), jnp.float32))
     return _run(start, jnp.any(free(start)))[0]
 
 
@@ -65,13 +66,21 @@ def missing(problem: MacroProblem, goal: Array) -> Array:
 def known(state: MacroState) -> Array:
     """[M] bool: somebody knows of it, be it solved or not."""
     problem = state.problem
-    count = jnp.sum(state.solved & problem.target_mask)
-    return (state.now >= problem.shown - SOON) & (problem.following <= count)
+    count = jnp.sum(state.solved & problem.target_mask & ~problem.looks)
+    found = jnp.any(problem.sight & state.solved[None], axis=1) | ~jnp.any(problem.sight, axis=1)
+    return (state.now >= problem.shown - SOON) & (problem.following <= count) & found
 
 
 def open_targets(state: MacroState) -> Array:
-    """[M] bool: known, neither solved nor being served."""
-    return ~state.solved & ~state.serving & known(state)
+    """[M] bool: known, neither solved nor being served, and of use."""
+    problem = state.problem
+    moot = problem.looks & ~jnp.any(problem.target_mask & ~known(state))
+    return ~state.solved & ~state.serving & known(state) & ~moot
+
+
+def finished(state: MacroState) -> Array:
+    """[] bool: every target is solved."""
+    return jnp.all(state.solved | state.problem.looks)
 
 
 def coming(state: MacroState) -> Array:
@@ -188,7 +197,7 @@ def step(state: MacroState, choice: Array) -> MacroResult:
         origin=jnp.where(going, state.node, state.origin), leg=jnp.where(going, leg, state.leg),
         busy=jnp.where(going, leg, state.busy), travelled=state.travelled + leg)
     after, dead = _run(out, jnp.array(False))
-    done = jnp.all(after.solved)
+    done = finished(after)
     # Who served nothing more was on the way home since it was last free.
     way = jnp.where(problem.agent_mask, _way_home(problem, after.node), 0.0)
     end = jnp.maximum(jnp.max(jnp.where(problem.agent_mask, after.since + way, 0.0)), after.now)
@@ -266,7 +275,7 @@ def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
     def waits(carry: tuple) -> Array:
         state, dead, moved, again = carry
         decide = moved & ~again & jnp.any(free(state)) & jnp.any(open_targets(state))
-        return ~(jnp.all(state.solved) | dead | decide)
+        return ~(finished(state) | dead | decide)
 
     def event(carry: tuple) -> tuple:
         state, _, _, again = carry
@@ -292,7 +301,8 @@ def _start(state: MacroState) -> MacroState:
     met = jnp.all(missing(problem, there) == 0, axis=1) & ~jnp.any(coming, axis=0)
     before = jnp.all(~problem.after | state.solved[None], axis=1)
     window = (state.now >= problem.appears - SOON) & (state.now <= problem.lapses + SOON)
-    starts = open_targets(state) & met & before & window
+    # Who has come to look does so, of use or not.
+    starts = ~state.solved & ~state.serving & known(state) & met & before & window
     at_once = starts & (problem.service <= 0)
     here = jnp.minimum(state.goal, targets - 1)
     serves = waiting & starts[here]
@@ -300,7 +310,8 @@ def _start(state: MacroState) -> MacroState:
     return replace(
         state, serving=state.serving | (starts & ~at_once), solved=state.solved | at_once,
         busy=jnp.where(serves, problem.service[here], state.busy),
-        goal=jnp.where(ends, targets, state.goal), since=jnp.where(ends, state.now, state.since))
+        goal=jnp.where(ends, targets, state.goal), since=jnp.where(ends, state.now, state.since),
+        begun=state.begun + state.now * jnp.sum(starts & ~problem.looks))
 
 
 def _advance(state: MacroState) -> tuple[MacroState, Array]:

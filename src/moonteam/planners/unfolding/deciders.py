@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 
@@ -25,6 +25,9 @@ OPTIONS = 6
 NOT_DONE = 2.0
 """Times its limit that an imagined mission counts which does not end well."""
 
+Goal = Literal["makespan", "waiting"]
+GOALS: tuple[Goal, ...] = ("makespan", "waiting")
+"""What counts in an imagined mission: when it ends, or how long its targets wait."""
 
 Choose = Callable[[list[View]], list[np.ndarray]]
 """Of missions at an event [B], what everybody goes for, [N] each."""
@@ -73,8 +76,8 @@ class OverFutures:
     At every event so many futures are drawn of what is expected. What everybody could do first
     comes from the plan of what is known, and from a plan for each of the futures as if it were
     known; where that leads to a target which nobody knows of yet, its place is gone to. Up to
-    `OPTIONS` of these are tried in every future, and go on by replanning. The least mean makespan
-    wins, if it is under replanning's by more than its standard error: the best of several means of
+    `OPTIONS` of these are tried in every future, and go on by replanning. The least mean of what
+    counts wins, if it is under that of replanning by more than its standard error: the best of several means of
     few futures flatters itself.
 
     Args:
@@ -83,11 +86,13 @@ class OverFutures:
       seed: of the draws.
       pattern: by which is looked for what is hidden.
       choose: who decides otherwise, and goes on, in place of replanning; see `play_together`.
+      goal: what is to be least.
     """
 
     def __init__(self, planner: TimedPlanner, futures: int, seed: int = 0,
-                 pattern: Pattern | None = None, choose: Choose | None = None):
-        self._planner, self._count, self._pattern = planner, futures, pattern
+                 pattern: Pattern | None = None, choose: Choose | None = None,
+                 goal: Goal = "makespan"):
+        self._planner, self._count, self._pattern, self._goal = planner, futures, pattern, goal
         self._rng, self._choose = np.random.default_rng(seed), choose
         self._base = Replanning(planner, pattern)
 
@@ -140,9 +145,11 @@ class OverFutures:
             play(world, decider)
 
     def _cost(self, world: World) -> float:
-        """s of an imagined mission, from its start."""
+        """s of an imagined mission, from its start; or of waiting, a target."""
         out = world.outcome
-        return out.seconds if out.success else NOT_DONE * world.state.limit / MS
+        if out.success:
+            return out.waited if self._goal == "waiting" else out.seconds
+        return NOT_DONE * world.state.limit / MS
 
 
 def play(world: World, decider: Decider) -> None:

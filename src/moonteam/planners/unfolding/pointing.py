@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from moonteam.grid.macro import world
-from moonteam.grid.macro.types import MacroProblem
+from moonteam.grid.macro.types import MacroProblem, MacroState
 from moonteam.planners import macro
 from moonteam.planners.seconds.keeper import WAIT
 from moonteam.planners.seconds.macro import problem_of
@@ -42,7 +42,7 @@ class Pointing:
         problems = macro.stacked([problem_of(view.moment) for view in views])
         bound = np.full(problems.free.shape, -1, np.int32)
         for row, view in zip(bound, views, strict=True):
-            row[:len(view.places)] = _bound(view)
+            row[:len(view.places)] = bound_of(view)
         found = np.asarray(_point(self._spec, self._params, problems, bound, self._preference))
         chosen = []
         for row, own, view in zip(found, bound, views, strict=True):
@@ -52,20 +52,25 @@ class Pointing:
         return chosen
 
 
-def _bound(view: View) -> list[int]:
+def bound_of(view: View) -> list[int]:
     """[N] the open target at which each robot waits; -1 of the others."""
     return [body.goal if body.phase == "there" and isinstance(body.goal, int) and body.goal >= 0
             and not view.moment.solved[body.goal] else -1 for body in view.state.bodies]
+
+
+def begun(problems: MacroProblem, bound: Array) -> MacroState:
+    """The states [B] in which those `bound` [B, N] to a target, where they wait, do not choose."""
+    states = jax.vmap(world.reset)(problems)
+    held = (bound >= 0) & problems.agent_mask
+    goal, node = (jnp.where(held, bound, x) for x in (states.goal, states.node))
+    return replace(states, goal=goal, node=node)
 
 
 @partial(jax.jit, static_argnames="spec")
 def _point(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
            preference: Array) -> Array:
     """[B, N] int32 choices; M for waiting, and of those `bound` [B, N] to a target already."""
-    states = jax.vmap(world.reset)(problems)
-    held = (bound >= 0) & problems.agent_mask
-    goal, node = (jnp.where(held, bound, x) for x in (states.goal, states.node))
-    states = replace(states, goal=goal, node=node)
+    states = begun(problems, bound)
     liking = jnp.broadcast_to(preference, states.now.shape)
     logits = pointer.point(params, spec, jax.vmap(pointer.look)(states, liking)).logits
     choice, _ = jax.vmap(world.choose)(states, logits, jnp.zeros_like(logits))

@@ -155,6 +155,6 @@ def _ms(metres: Floats, speed: float | Floats) -> Int64:
 
 
 def distances(a: Floats, b: Floats, metric: str) -> Floats:
-    """[A, B] metres from places a [A, 2] to b [B, 2]."""
-    shift = np.abs(a[:, None, :] - b[None, :, :])
-    return shift.sum(2) if metric == "manhattan" else np.hypot(shift[..., 0], shift[..., 1])
+    """[..., A, B] metres from places a [..., A, 2] to b [..., B, 2]."""
+    shift = np.abs(a[..., :, None, :] - b[..., None, :, :])
+    return shift.sum(-1) if metric == "manhattan" else np.hypot(shift[..., 0], shift[..., 1])

@@ -1,0 +1,319 @@
+"""A policy that looks ahead: it plays what it would do, and what else it could, in many futures.
+
+Where targets follow on others or arrive by a clock, what is to come can be drawn, and the policy
+can go on in each of these futures by its likeliest choices to the end, thousands of them in one
+call of the macro world. That is one step of policy iteration, at the moment itself.
+
+Legend: B missions, K tries of a mission, F futures, R rollouts of a call, N robots, T targets, the
+open and then the coming ones, padded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from moonteam import trees
+from moonteam.grid.macro import world
+from moonteam.grid.macro.draw import places
+from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
+from moonteam.planners import macro
+from moonteam.planners.seconds.base import MS
+from moonteam.planners.seconds.keeper import WAIT
+from moonteam.planners.seconds.macro import problem_of
+from moonteam.planners.unfolding.deciders import GOALS, Goal
+from moonteam.planners.unfolding.future import Future, future
+from moonteam.planners.unfolding.pointing import begun, bound_of
+from moonteam.planners.unfolding.state import distances
+from moonteam.planners.unfolding.world import View
+from moonteam.policies import pointer
+from moonteam.policies.pointer import PointerSpec
+from moonteam.policies.policy import Policy
+
+HEAT = 2.0
+"""Temperature at which the other tries are drawn."""
+TRIES = 16
+"""K, joint choices drawn at a moment, the likeliest first; equal ones are one."""
+FIRST = 16
+"""Futures in which all tries are played; then twice as many, and so on, with those still in it."""
+SURE = 2.0
+"""Standard errors behind the best at which a try drops out."""
+ROWS = 512
+"""R."""
+LONGEST = 64
+"""Decisions after which a rollout is given up, with twice its limit."""
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A moment at which there is something to choose."""
+
+    view: View
+    open_: np.ndarray  # targets that can still be gone for
+    bound: np.ndarray  # [N] int32, place in `open_` of who waits there for others; -1: free
+    tries: np.ndarray  # [K, N] int32, places in `open_`; T and above: waits
+    rng: np.random.Generator
+
+
+class LookingAhead:
+    """The policy's choice unless another is better in the mean over futures.
+
+    Joint choices are drawn from the policy and raced: all are played in a few futures that they
+    share, who is clearly behind the best drops out, and the others go on with as many futures
+    again. What gains most over the likeliest is done, if it gains more than its standard error.
+    Draws depend on the moment and the seed alone, not on what other missions are played beside it.
+
+    Args:
+      policy: of kind pointer.
+      futures: F, the most that are drawn at a moment.
+      goal: what counts in a future: its makespan, or how long targets wait for their services.
+      seed: of the draws.
+      preference: 0 time .. 1 effort, of the policy.
+
+    Raises InputError for a policy that does not point at targets.
+    """
+
+    def __init__(self, policy: Policy, futures: int, goal: Goal = "makespan", seed: int = 0,
+                 preference: float = 0.0):
+        self._spec, self._params = macro.spec_of(policy), policy.params
+        self._futures, self._goal, self._seed = futures, GOALS.index(goal), seed
+        self._preference = np.float32(preference)
+
+    def choose(self, views: Sequence[View]) -> list[np.ndarray]:
+        """[B] of [N] int64: a target's number or WAIT."""
+        # Who plays side by side fills calls up with the first view.
+        once = {id(view): view for view in views}
+        asked = self._ask(list(once.values()), len(views))
+        best = dict(zip(once, self._best(asked), strict=True))
+        return [best[id(view)] for view in views]
+
+    def _ask(self, views: list[View], size: int) -> list[_Asked]:
+        """What the policy could do at each moment [B]; calls are filled up to `size`."""
+        filled = views + views[:1] * (size - len(views))
+        problems = macro.stacked([problem_of(view.moment) for view in filled])
+        targets = problems.service.shape[1]
+        bound = np.full(problems.free.shape, -1, np.int32)
+        for row, view in zip(bound, filled, strict=True):
+            row[:len(view.places)] = bound_of(view)
+        rngs = [self._rng(view) for view in views]
+        seeds = np.zeros(size, np.uint32)
+        seeds[:len(views)] = [rng.integers(2**32) for rng in rngs]
+        drawn = np.asarray(_drawn(self._spec, self._params, problems, bound, seeds,
+                                  self._preference))
+        found = []
+        for view, own, tries, rng in zip(views, bound, drawn, rngs, strict=False):
+            count = len(view.places)
+            open_ = np.flatnonzero(~view.moment.solved)
+            place = np.full(targets + 1, targets, np.int32)  # of padding and waiting: past the last
+            place[open_] = np.arange(len(open_))
+            held = own[:count]
+            different = np.unique(tries[:, :count], axis=0, return_index=True)[1]
+            found.append(_Asked(view, open_, np.where(held >= 0, place[held], -1).astype(np.int32),
+                                place[tries[np.sort(different), :count]], rng))
+        return found
+
+    def _rng(self, view: View) -> np.random.Generator:
+        where = np.rint(MS * view.places).astype(np.int64).reshape(-1)
+        return np.random.default_rng([self._seed, view.now, *np.abs(where).tolist()])
+
+    def _best(self, asked: list[_Asked]) -> list[np.ndarray]:
+        """[B] of [N]."""
+        chosen = [0] * len(asked)
+        left = {b: np.arange(len(one.tries)) for b, one in enumerate(asked) if len(one.tries) > 1}
+        costs: dict[int, np.ndarray] = {b: np.zeros((len(k), 0)) for b, k in left.items()}
+        played, count = 0, min(FIRST, self._futures)
+        while left:
+            for b, own in self._costs(asked, left, count).items():
+                costs[b] = np.concatenate([costs[b], own], axis=1)
+            played += count
+            for b in list(left):
+                best, stays = raced(costs[b], bool(left[b][0] == 0))
+                chosen[b] = int(left[b][best])
+                left[b], costs[b] = left[b][stays], costs[b][stays]
+                if len(left[b]) == 1 or played >= self._futures:
+                    del left[b]
+            count = min(played, self._futures - played)
+        found = []
+        for one, k in zip(asked, chosen, strict=True):
+            place = np.where(one.bound >= 0, one.bound, one.tries[k])
+            some_ = place < len(one.open_)
+            found.append(np.where(some_, one.open_[np.where(some_, place, 0)], WAIT)
+                         if len(one.open_) else np.full(len(place), WAIT))
+        return found
+
+    def _costs(self, asked: list[_Asked], left: dict[int, np.ndarray],
+               count: int) -> dict[int, np.ndarray]:
+        """[tries, F] s, of the tries `left` of each mission, in `count` futures that they share."""
+        sizes: dict[int, list[int]] = {}
+        for b in left:
+            sizes.setdefault(macro.padded(len(asked[b].open_) + asked[b].view.coming), []).append(b)
+        found = {}
+        for size, missions in sizes.items():
+            problems, rows, firsts, bounds = [], [], [], []
+            for b in missions:
+                one = asked[b]
+                base = len(problems) * count
+                problems.append(imagined(one.view, [future(one.view, one.rng)
+                                                    for _ in range(count)], size))
+                tries = one.tries[left[b]]
+                rows.append(np.tile(base + np.arange(count), len(tries)))
+                firsts.append(np.repeat(np.where(tries < len(one.open_), tries, size), count, 0))
+                bounds.append(np.tile(one.bound, (len(tries) * count, 1)))
+            whole: MacroProblem = jax.tree.map(lambda *x: np.concatenate(x), *problems)
+            costs = self._rolled(whole, *(np.concatenate(x) for x in (rows, firsts, bounds)))
+            ends = np.cumsum([len(row) for row in rows])
+            for b, own in zip(missions, np.split(costs, ends[:-1]), strict=True):
+                found[b] = own.reshape(-1, count)
+        return found
+
+    def _rolled(self, problems: MacroProblem, row: np.ndarray, first: np.ndarray,
+                bound: np.ndarray) -> np.ndarray:
+        """[rollouts] s; of each its problem's row, what everybody does first, who is bound."""
+        found = []
+        for at in range(0, len(row), ROWS):
+            own = np.minimum(np.arange(at, at + ROWS), len(row) - 1)
+            part = jax.tree.map(lambda x, own=own: x[row[own]], problems)
+            both = _played(self._spec, self._params, part, bound[own],
+                           first[own].astype(np.int32), self._preference)
+            found.append(both[self._goal])
+        return np.concatenate(jax.device_get(found))[:len(row)].astype(np.float64)
+
+
+def raced(costs: np.ndarray, usual: bool) -> tuple[int, np.ndarray]:
+    """Which try is done, of costs [K, F] that share their futures, and which [K] bool go on.
+
+    The first, if it is what is `usual`, is kept until another is clearly better: the best of
+    several means flatters itself.
+    """
+    root = math.sqrt(costs.shape[1])
+    best = int(costs.mean(1).argmin())
+    behind = costs - costs[best]
+    stays = behind.mean(1) <= SURE * behind.std(1, ddof=1) / root
+    if usual and behind[0].mean() <= behind[0].std(ddof=1) / root:
+        best = 0
+    return best, stays
+
+
+def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
+    """[F] the mission from now on in each of these futures, padded to `size` targets.
+
+    NumPy arrays. A target that comes is known of when it comes, as in the mission; whose service
+    is under way counts as solved.
+    """
+    known, state = problem_of(view.moment), view.state
+    open_ = np.flatnonzero(~view.moment.solved)
+    count, coming, team = len(futures), view.coming, len(view.places)
+    total = len(open_) + coming
+    spots = np.zeros((count, size, 2))
+    spots[:, :len(open_)] = np.array([view.targets[j].at for j in open_], float).reshape(-1, 2)
+    after = [one.coming for one in futures]
+    spots[:, len(open_):total] = np.array([[t.at for t in ts] for ts in after],
+                                          float).reshape(count, coming, 2)
+    there = np.arange(size) < total
+    speed = np.array([agent.speed for agent in view.agents])
+    metric = state.problem.metric
+    far = distances(spots, spots, metric)
+    both = there[:, None] & there[None]
+    now = view.now / MS
+    need = np.zeros((count, size, len(state.names)), np.int32)
+    columns: dict[str, Any] = {"need": need}
+    for name in ("either", "service", "appears", "lapses", "shown", "following"):
+        values = np.asarray(getattr(known, name))
+        column = np.full((count, size), FAR if name == "lapses" else 0, values.dtype)
+        column[:, :len(open_)] = values[open_]
+        columns[name] = column
+    need[:, :len(open_)] = known.need[open_]
+    under_way = int((view.moment.ends > 0).sum())
+    ended = int(view.moment.solved.sum()) - under_way
+    for f, targets in enumerate(after):
+        for k, target in enumerate(targets, len(open_)):
+            asks = target.needs()
+            need[f, k] = [asks.get(skill, 0) for skill in state.names]
+            columns["either"][f, k] = target.type == "OR" and not target.coalition
+            columns["appears"][f, k] = columns["shown"][f, k] = max(target.appears - now, 0.0)
+            columns["following"][f, k] = max(target.following - ended - under_way, 0)
+    waits = np.zeros((count, size, size), bool)
+    waits[:, :len(open_), :len(open_)] = known.after[np.ix_(open_, open_)]
+    area = None if state.problem.expects is None else state.problem.expects.area
+    middle = np.zeros((count, size))
+    if coming and area is not None:
+        spread = places(np.array(area[:2]), np.array(area[2:]))
+        middle = distances(spots, spread, metric).mean(-1) / speed.max() * there
+    start = np.full((count, team, size), FAR, np.float32)
+    home = np.zeros((count, team, size), np.float32)
+    here = distances(view.places, spots, metric) / speed[:, None]
+    start[:, :, :total] = here[:, :, :total]
+    for i, agent in enumerate(view.agents):
+        if agent.home is not None:
+            way = distances(spots, np.array([agent.home], float), metric)[..., 0]
+            home[:, i] = way / agent.speed * there
+    columns |= {
+        "start": start, "home": home, "after": waits, "middle": middle.astype(np.float32),
+        "between": np.where(both, far[:, None] / speed[:, None, None], FAR).astype(np.float32),
+        "target_mask": np.broadcast_to(there, (count, size)),
+        "unit": np.array([macro.unit_of(a, known.has, b) for a, b in zip(start, need, strict=True)],
+                         np.float32)}
+    for name in ("home_now", "has", "free", "effort", "limit", "agent_mask", "middle_now",
+                 "coming"):
+        value = np.asarray(getattr(known, name))
+        columns[name] = np.broadcast_to(value, (count, *value.shape))
+    columns |= {"coming": np.zeros(count, np.int32), "sight": np.zeros_like(waits),
+                "looks": np.zeros((count, size), bool)}
+    return MacroProblem(**columns)
+
+
+@partial(jax.jit, static_argnames="spec")
+def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, seeds: Array,
+           preference: Array) -> Array:
+    """[B, K, N] int32 joint choices, the likeliest first; see `pointing`."""
+    states = begun(problems, bound)
+    logits = _said(spec, params, states, preference)
+
+    def tried(state: MacroState, logits: Array, seed: Array) -> Array:
+        noise = HEAT * jax.random.gumbel(jax.random.key(seed), (TRIES, *logits.shape))
+        return jax.vmap(lambda own: world.choose(state, logits, own)[0])(noise.at[0].set(0.0))
+
+    return cast(Array, jax.vmap(tried)(states, logits, seeds))
+
+
+@partial(jax.jit, static_argnames="spec")
+def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, first: Array,
+            preference: Array) -> tuple[Array, Array]:
+    """[R] s from now to the end, if the team does `first` [R, N] and then what is likeliest; and
+    the seconds at which its services start, added up.
+    """
+    begin = begun(problems, bound)
+    worst = 2.0 * problems.limit
+
+    def go(carry: tuple, choice: Array) -> tuple:
+        states, over, (cost, starts), turn = carry
+        result = jax.vmap(world.step)(states, choice)
+        after = jax.vmap(world.loosen)(result.state, jnp.ones(choice.shape, bool))
+        end = jnp.where(result.terminated, states.now + result.seconds, worst)
+        ended = over | result.terminated | result.truncated
+        cost = jnp.where(ended & ~over, end, cost)
+        late = after.begun + worst * jnp.sum(~after.solved & ~after.serving, axis=-1)
+        starts = jnp.where(ended & ~over, late, starts)
+        return trees.where(ended, states, after), ended, (cost, starts), turn + 1
+
+    def likeliest(carry: tuple) -> tuple:
+        logits = _said(spec, params, carry[0], preference)
+        return go(carry, jax.vmap(world.choose)(carry[0], logits, jnp.zeros_like(logits))[0])
+
+    start = go((begin, jnp.zeros(first.shape[0], bool), (worst, worst), 0), first)
+    return cast(tuple[Array, Array], jax.lax.while_loop(
+        lambda carry: jnp.any(~carry[1]) & (carry[3] < LONGEST), likeliest, start)[2])
+
+
+def _said(spec: PointerSpec, params: Any, states: MacroState, preference: Array) -> Array:
+    """Logits of each of a batch of moments."""
+    liking = jnp.broadcast_to(preference, states.now.shape)
+    return pointer.point(params, spec, jax.vmap(pointer.look)(states, liking)).logits
