@@ -54,9 +54,9 @@ def test_a_policy_plays_a_set_side_by_side_as_it_plays_one_mission():
         ["policy"], policies=[paths.find("any_team_mappo", "policies", ".safetensors")]))
     (row,) = unfolding.rows_of([contender], [], [])
     assert row.together
-    side_by_side = row.play_all(problems)
+    side_by_side = row.play_all(problems, 0)
     assert all(played.success for played in side_by_side)
-    (alone,) = row.play_all(problems[1:2])
+    (alone,) = row.play_all(problems[1:2], 0)
     assert (side_by_side[1].seconds, side_by_side[1].decisions) == (alone.seconds, alone.decisions)
 
 

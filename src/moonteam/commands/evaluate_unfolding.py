@@ -17,7 +17,7 @@ from moonteam.problem.timed import Timed
 FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", "table.md",
          "unfolding.png")
 """In --out."""
-Search = Literal["nearest", "sweep"]
+Search = Literal["nearest", "sweep", "places"]
 Goal = Literal["makespan", "waiting"]
 
 
@@ -33,7 +33,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     hindsight. Options marked "again" may be given several times.
 
     Where targets are hidden, robots that have nothing else to do look for them: nearest, to the
-    nearest ground not seen yet, or sweep, up and down a strip each.
+    nearest ground not seen yet, or sweep, up and down a strip each. With places, places to look
+    from are planned for as if they were targets (by lns or a policy such as searching).
 
     Files in --out: report.json, summary.csv, rows.csv, table.md and unfolding.png; and rows.jsonl,
     to which each mission is added as it is played (a policy's as a whole), so that --resume goes
@@ -60,7 +61,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     """What is to be least over futures: makespan, or waiting, which is how long targets wait for
     their services; again for more rows. Default: makespan."""
     search: Many[tuple[Search, ...]] = ()
-    """Where targets are hidden: nearest or sweep; again for more rows. Default: both."""
+    """Where targets are hidden: nearest, sweep or places; again for more rows. Default: the first
+    two."""
     policy: Many[tuple[str, ...]] = ()
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy; again for
     more."""
@@ -87,7 +89,7 @@ def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
         raise InputError("--goal", "has no effect without --futures")
     others = any(one.expects is not None and (one.expects.loss is not None or one.expects.scatter)
                  for one in found)
-    return found, hidden, not (hidden or others)
+    return found, hidden, not others
 
 
 def run(args: Args) -> int:

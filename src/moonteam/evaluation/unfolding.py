@@ -44,6 +44,8 @@ from moonteam.report.progress import track
 from moonteam.report.tables import Column
 
 PATTERNS: dict[str, Callable[[], Pattern]] = {"nearest": NearestUnseen, "sweep": Sweep}
+PLACES = "places"
+"""Beside the patterns: places to look from are planned for as if they were targets."""
 PANELS = (("gap", "seconds over the first row, %", 100.0),
           ("waited_gap", "waiting over the first row, %", 100.0),
           ("success", "success", 1.0))
@@ -90,13 +92,16 @@ class Row:
         return self.ahead or (self.contender.together and not self.futures)
 
     def _replanning(self) -> Replanning:
-        return Replanning(self.planner, PATTERNS[self.pattern]() if self.pattern else None)
+        return Replanning(self.planner, self._searching(), self.pattern == PLACES)
+
+    def _searching(self) -> Pattern | None:
+        return PATTERNS[self.pattern]() if self.pattern in PATTERNS else None
 
     def decider(self, number: int, seed: int) -> Decider:
         """Who decides in mission `number`."""
         if not self.futures:
             return self._replanning()
-        pattern = PATTERNS[self.pattern]() if self.pattern else None
+        pattern = self._searching()
         choose = pointing(self.planner)
         planner = self.planner if choose is None else ExactPlanner()
         return OverFutures(planner, self.futures, seed * 1_000_003 + number, pattern, choose,
@@ -156,7 +161,8 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             patterns: Sequence[str], goals: Sequence[Goal] = (), ahead: bool = False) -> list[Row]:
     """Every planner alone, then over so many futures, by every pattern of search.
 
-    `ahead`: nothing but targets comes, so that policies can look ahead in the macro world.
+    `ahead`: nothing but targets comes, so that policies can look ahead in the macro world; where
+    targets are hidden, in which there are places to look from.
 
     Raises InputError for a number of futures that is none.
     """
@@ -169,8 +175,9 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
         over = futures if not one.together or points else ()
         for pattern in patterns or [""]:
             found += [Row(one, 0, pattern)]
-            found += [Row(one, count, pattern, goal, ahead and points)
-                      for count in over for goal in goals or GOALS[:1]]
+            looks = ahead and points and pattern in ("", PLACES)
+            found += [Row(one, count, pattern, goal, looks) for count in over
+                      for goal in goals or GOALS[:1] if looks or pattern != PLACES]
     return found
 
 

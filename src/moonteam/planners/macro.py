@@ -40,7 +40,8 @@ FEW = 8.0
 _CHUNK = 4096  # episodes of a call, more only if one problem's tries are
 _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": "NS",
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
-         "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "", "middle": "M", "middle_now": "N",
+         "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "",
+         "middle": "M", "middle_now": "N",
          "lapses": "M", "free": "N", "effort": "N", "limit": "",
          "agent_mask": "N", "target_mask": "M", "unit": ""}
 _PADDING = {"start": FAR, "between": FAR, "lapses": FAR}  # zero and False elsewhere

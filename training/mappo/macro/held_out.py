@@ -45,7 +45,8 @@ def moment_of(problem: MacroProblem) -> Moment:
         need=np.asarray(problem.need, np.int64), either=np.asarray(problem.either),
         service=_ms(problem.service), after=np.asarray(problem.after),
         appears=_ms(problem.appears), lapses=_ms(problem.lapses), free=_ms(problem.free),
-        present=np.asarray(problem.agent_mask), solved=~np.asarray(problem.target_mask) | np.asarray(problem.looks),
+        present=np.asarray(problem.agent_mask),
+        solved=~np.asarray(problem.target_mask) | np.asarray(problem.looks),
         ends=np.zeros(targets, np.int64), effort=np.asarray(problem.effort, np.float64))
 
 

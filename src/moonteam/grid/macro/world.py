@@ -73,8 +73,7 @@ def known(state: MacroState) -> Array:
 
 def open_targets(state: MacroState) -> Array:
     """[M] bool: known, neither solved nor being served, and of use."""
-    problem = state.problem
-    moot = problem.looks & ~jnp.any(problem.target_mask & ~known(state))
+    moot = state.problem.looks & (coming(state) == 0)
     return ~state.solved & ~state.serving & known(state) & ~moot
 
 

@@ -28,10 +28,9 @@ from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.planners import macro
 from moonteam.planners.seconds.base import MS
 from moonteam.planners.seconds.keeper import WAIT
-from moonteam.planners.seconds.macro import problem_of
 from moonteam.planners.unfolding.deciders import GOALS, Goal
 from moonteam.planners.unfolding.future import Future, future
-from moonteam.planners.unfolding.pointing import begun, bound_of
+from moonteam.planners.unfolding.pointing import begun, bound_of, problem_in
 from moonteam.planners.unfolding.state import distances
 from moonteam.planners.unfolding.world import View
 from moonteam.policies import pointer
@@ -98,7 +97,7 @@ class LookingAhead:
     def _ask(self, views: list[View], size: int) -> list[_Asked]:
         """What the policy could do at each moment [B]; calls are filled up to `size`."""
         filled = views + views[:1] * (size - len(views))
-        problems = macro.stacked([problem_of(view.moment) for view in filled])
+        problems = macro.stacked([problem_in(view) for view in filled])
         targets = problems.service.shape[1]
         bound = np.full(problems.free.shape, -1, np.int32)
         for row, view in zip(bound, filled, strict=True):
@@ -208,12 +207,13 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     NumPy arrays. A target that comes is known of when it comes, as in the mission; whose service
     is under way counts as solved.
     """
-    known, state = problem_of(view.moment), view.state
+    known, state = problem_in(view), view.state
     open_ = np.flatnonzero(~view.moment.solved)
     count, coming, team = len(futures), view.coming, len(view.places)
     total = len(open_) + coming
     spots = np.zeros((count, size, 2))
-    spots[:, :len(open_)] = np.array([view.targets[j].at for j in open_], float).reshape(-1, 2)
+    known_at = np.array([*(t.at for t in view.targets), *(look.at for look in view.looks)], float)
+    spots[:, :len(open_)] = known_at.reshape(-1, 2)[open_]
     after = [one.coming for one in futures]
     spots[:, len(open_):total] = np.array([[t.at for t in ts] for ts in after],
                                           float).reshape(count, coming, 2)
@@ -223,9 +223,9 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     far = distances(spots, spots, metric)
     both = there[:, None] & there[None]
     now = view.now / MS
-    need = np.zeros((count, size, len(state.names)), np.int32)
+    need = np.zeros((count, size, known.need.shape[1]), np.int32)
     columns: dict[str, Any] = {"need": need}
-    for name in ("either", "service", "appears", "lapses", "shown", "following"):
+    for name in ("either", "service", "appears", "lapses", "shown", "following", "looks"):
         values = np.asarray(getattr(known, name))
         column = np.full((count, size), FAR if name == "lapses" else 0, values.dtype)
         column[:, :len(open_)] = values[open_]
@@ -236,7 +236,7 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     for f, targets in enumerate(after):
         for k, target in enumerate(targets, len(open_)):
             asks = target.needs()
-            need[f, k] = [asks.get(skill, 0) for skill in state.names]
+            need[f, k, :len(state.names)] = [asks.get(skill, 0) for skill in state.names]
             columns["either"][f, k] = target.type == "OR" and not target.coalition
             columns["appears"][f, k] = columns["shown"][f, k] = max(target.appears - now, 0.0)
             columns["following"][f, k] = max(target.following - ended - under_way, 0)
@@ -247,6 +247,7 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     if coming and area is not None:
         spread = places(np.array(area[:2]), np.array(area[2:]))
         middle = distances(spots, spread, metric).mean(-1) / speed.max() * there
+    has = np.asarray(known.has)
     start = np.full((count, team, size), FAR, np.float32)
     home = np.zeros((count, team, size), np.float32)
     here = distances(view.places, spots, metric) / speed[:, None]
@@ -259,14 +260,18 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
         "start": start, "home": home, "after": waits, "middle": middle.astype(np.float32),
         "between": np.where(both, far[:, None] / speed[:, None, None], FAR).astype(np.float32),
         "target_mask": np.broadcast_to(there, (count, size)),
-        "unit": np.array([macro.unit_of(a, known.has, b) for a, b in zip(start, need, strict=True)],
+        "unit": np.array([macro.unit_of(a, has, b) for a, b in zip(start, need, strict=True)],
                          np.float32)}
     for name in ("home_now", "has", "free", "effort", "limit", "agent_mask", "middle_now",
                  "coming"):
         value = np.asarray(getattr(known, name))
         columns[name] = np.broadcast_to(value, (count, *value.shape))
-    columns |= {"coming": np.zeros(count, np.int32), "sight": np.zeros_like(waits),
-                "looks": np.zeros((count, size), bool)}
+    columns |= {"coming": np.zeros(count, np.int32), "sight": np.zeros_like(waits)}
+    if view.looks:
+        reach = max(agent.sensor or 0.0 for agent in view.agents)
+        hidden = np.zeros((count, size), bool)
+        hidden[:, len(open_):total] = [[target.hidden for target in ts] for ts in after]
+        columns["sight"] = (far <= reach) & hidden[:, :, None] & columns["looks"][:, None]
     return MacroProblem(**columns)
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from moonteam.planners.seconds.base import MS, TimedPlanner
 from moonteam.planners.seconds.keeper import HOME, Keeper, choices, order_of
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.search import Pattern
+from moonteam.planners.unfolding.ground import INSIDE
+from moonteam.planners.unfolding.search import Pattern, with_looks
 from moonteam.planners.unfolding.state import Order
 from moonteam.planners.unfolding.world import View, World
 
@@ -45,22 +46,36 @@ class Replanning:
     """Plans what is known of anew at every event, and looks no further.
 
     A plan is kept until another is better. Robots that it has nothing for go home, or look for
-    hidden targets by the pattern.
+    hidden targets by the pattern; or, with `places`, places to look from are planned for as if
+    they were targets.
     """
 
-    def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None):
-        self._pattern = pattern
+    def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None,
+                 places: bool = False):
+        self._planner, self._pattern, self._places = planner, pattern, places
         self._keeper = Keeper(planner, margin_ms=0)
 
     def act(self, view: View) -> list[Order]:
         """See `Decider`."""
+        view = self.shown(view)
         if view.moment.solved.all():
             return self.settled(view, np.full(len(view.places), HOME))
+        if view.looks:  # other places at every event: there is no plan to keep
+            plan = self._planner.plan(view.moment)
+            return self.settled(view, choices(view.moment, order_of(plan)))
         return self.settled(view, self._keeper.act(view.moment))
+
+    def shown(self, view: View) -> View:
+        """What is planned for: with the places to look from, where these count as targets."""
+        return with_looks(view) if self._places else view
 
     def settled(self, view: View, chosen: np.ndarray) -> list[Order]:
         """The choices [N], those who have none looking for what is hidden."""
         orders: list[Order] = [int(choice) for choice in chosen]
+        for i, choice in enumerate(orders):
+            if view.looks and isinstance(choice, int) and choice >= len(view.targets):
+                look, reach = view.looks[choice - len(view.targets)], view.agents[i].sensor or 0.0
+                orders[i] = look.from_afar(view.places[i], INSIDE * reach)
         if self._pattern is None or not view.coming or view.ground is None:
             return orders
         idle = [i for i in np.flatnonzero(view.moment.present & (chosen < 0)).tolist()
@@ -77,8 +92,8 @@ class OverFutures:
     comes from the plan of what is known, and from a plan for each of the futures as if it were
     known; where that leads to a target which nobody knows of yet, its place is gone to. Up to
     `OPTIONS` of these are tried in every future, and go on by replanning. The least mean of what
-    counts wins, if it is under that of replanning by more than its standard error: the best of several means of
-    few futures flatters itself.
+    counts wins, if it is under that of replanning by more than its standard error: the best of
+    several means of few futures flatters itself.
 
     Args:
       planner: by which is planned, in hindsight and when replanning.
@@ -171,7 +186,7 @@ def play_together(worlds: Sequence[World], choose: Choose, deciders: Sequence[Re
     size = size or len(worlds)
     left = [k for k, world in enumerate(worlds) if not world.over]
     while left:
-        views = {k: worlds[k].view() for k in left}
+        views = {k: deciders[k].shown(worlds[k].view()) for k in left}
         asked = [k for k in left if not views[k].moment.solved.all()]
         given = [views[k] for k in asked]
         found = choose(given + given[:1] * (size - len(given))) if asked else []

@@ -6,14 +6,40 @@ Legend: H rows from south to north, W columns from west to east.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.problem.timed import Timed
+from moonteam.problem.timed import Place, Timed
 
 Floats = npt.NDArray[np.float64]
+
+INSIDE = 0.98
+"""Share of a sensor's reach from which a point is looked at."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """A place from which all that is not seen yet of a part of the ground can be seen."""
+
+    at: Place
+    unseen: Floats  # [U, 2] m
+
+    def from_afar(self, here: Floats, reach: float) -> Place:
+        """The first place, to a hair, on the straight way there from which it is all in reach."""
+        way = np.asarray(self.at) - here
+
+        def sees(share: float) -> bool:
+            return bool((np.hypot(*(self.unseen - (here + share * way)).T) <= reach).all())
+
+        low, high = 0.0, 0.0 if sees(0.0) else 1.0
+        while high - low > 1e-3:
+            middle = (low + high) / 2
+            low, high = (low, middle) if sees(middle) else (middle, high)
+        x, y = here + high * way
+        return float(x), float(y)
 
 
 @dataclass
@@ -44,6 +70,21 @@ class Ground:
     def unseen(self) -> Floats:
         """[U, 2] m."""
         return self.points[~self.seen]
+
+    def looks(self, reach: float) -> list[Look]:
+        """Places to look from: the middles of equal parts, each to be seen whole from there."""
+        size = self.points[-1, -1] - self.points[0, 0]
+        wide, high = (max(1, math.ceil(v / (math.sqrt(2) * reach))) for v in size.tolist())
+        rows, columns = (np.array_split(np.arange(n), parts) for n, parts in zip(
+            self.seen.shape, (high, wide), strict=True))
+        found = []
+        for own in itertools.product(rows, columns):
+            part = np.ix_(*own)
+            unseen = self.points[part][~self.seen[part]]
+            if len(unseen):
+                x, y = (unseen.min(0) + unseen.max(0)) / 2
+                found.append(Look((float(x), float(y)), unseen))
+        return found
 
     def see(self, way: Floats, reach: float) -> None:
         """What is within reach of a way [P, 2] is seen."""

@@ -1,6 +1,6 @@
 """A policy that decides in missions that unfold by its likeliest choice, and plans nothing.
 
-Legend: B missions, N robots, M targets known of.
+Legend: B missions, N robots, M targets known of and places to look from.
 """
 
 from __future__ import annotations
@@ -39,17 +39,23 @@ class Pointing:
 
     def choose(self, views: Sequence[View]) -> list[np.ndarray]:
         """[B] of [N] int64: a target's number or WAIT."""
-        problems = macro.stacked([problem_of(view.moment) for view in views])
+        problems = macro.stacked([problem_in(view) for view in views])
         bound = np.full(problems.free.shape, -1, np.int32)
         for row, view in zip(bound, views, strict=True):
             row[:len(view.places)] = bound_of(view)
         found = np.asarray(_point(self._spec, self._params, problems, bound, self._preference))
         chosen = []
         for row, own, view in zip(found, bound, views, strict=True):
-            count, targets = len(view.places), len(view.targets)
+            count, targets = len(view.places), len(view.moment.solved)
             free = np.where(row < targets, row, WAIT)
             chosen.append(np.where(own >= 0, own, free)[:count].astype(np.int64))
         return chosen
+
+
+def problem_in(view: View) -> MacroProblem:
+    """What is known as a problem of the macro world (NumPy arrays)."""
+    problem = problem_of(view.moment)
+    return replace(problem, looks=np.arange(len(problem.looks)) >= len(view.targets))
 
 
 def bound_of(view: View) -> list[int]:

@@ -1,4 +1,4 @@
-"""Two patterns by which robots with eyes look for hidden targets, to compare with.
+"""How robots with eyes look for hidden targets: two patterns, and places as if they were targets.
 
 Legend: N robots, U points not seen yet.
 """
@@ -6,16 +6,16 @@ Legend: N robots, U points not seen yet.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
-from moonteam.planners.unfolding.state import distances
+from moonteam.planners.seconds.base import NEVER
+from moonteam.planners.unfolding.ground import INSIDE
+from moonteam.planners.unfolding.state import distances, ms
 from moonteam.planners.unfolding.world import View
 from moonteam.problem.timed import Place
-
-INSIDE = 0.98
-"""Share of a sensor's reach from which a point is looked at."""
 
 
 class Pattern(Protocol):
@@ -106,6 +106,43 @@ class Sweep:
                 lanes += [(x, low), (x, high)] if up else [(x, high), (x, low)]
                 up = not up
             self._lanes[i] = lanes
+
+
+def with_looks(view: View) -> View:
+    """What is known, with a column in `moment` for each place to look from, the last ones: as if
+    it were a target that needs somebody with eyes, and no time.
+
+    Without any where nothing is hidden any more.
+    """
+    reach = [INSIDE * agent.sensor for agent in view.agents if agent.sensor is not None]
+    if view.ground is None or not view.coming or not reach:
+        return view
+    looks, now, metric = view.ground.looks(min(reach)), view.moment, view.state.problem.metric
+    more, targets = len(looks), len(view.targets)
+    places = np.array([look.at for look in looks], float).reshape(-1, 2)
+    spots = np.concatenate([np.array([t.at for t in view.targets], float).reshape(-1, 2), places])
+    speeds = np.array([agent.speed for agent in view.agents])
+    eyes = np.array([agent.sensor is not None for agent in view.agents])
+    far = distances(spots, spots, metric)
+    between = np.stack([ms(far, speed) for speed in sorted(set(speeds.tolist()))])
+    between[:, :targets, :targets] = now.between
+    need = np.zeros((targets + more, now.need.shape[1] + 1), np.int64)
+    need[:targets, :-1], need[targets:, -1] = now.need, 1
+    after = np.zeros((targets + more,) * 2, bool)
+    after[:targets, :targets] = now.after
+
+    def longer(column: np.ndarray, value: int = 0) -> np.ndarray:
+        return np.concatenate([column, np.full(more, value, column.dtype)])
+
+    start = ms(distances(view.places, places, metric), speeds[:, None])
+    moment = replace(
+        now, start=np.concatenate([now.start, start], 1), between=between,
+        home=np.concatenate([now.home, np.zeros_like(start)], 1),
+        has=np.concatenate([now.has, eyes[:, None]], 1), need=need, either=longer(now.either),
+        service=longer(now.service), after=after, appears=longer(now.appears),
+        lapses=longer(now.lapses, NEVER), solved=longer(now.solved), ends=longer(now.ends),
+        middle=view.state.middle(spots))
+    return replace(view, moment=moment, looks=tuple(looks))
 
 
 def from_afar(here: np.ndarray, point: np.ndarray, reach: float) -> Place:

@@ -117,11 +117,11 @@ class State:
         speeds = np.array([agent.speed for agent in agents])
         metric = self.problem.metric
         free = [body.until - self.now if body.phase == "serving" else 0 for body in self.bodies]
-        home_now = [0 if agent.home is None else _ms(
+        home_now = [0 if agent.home is None else ms(
             distances(here[i:i + 1], np.array([agent.home], float), metric), agent.speed)[0, 0]
             for i, agent in enumerate(agents)]
         return replace(
-            known, start=_ms(distances(here, self._spots, metric), speeds[:, None]),
+            known, start=ms(distances(here, self._spots, metric), speeds[:, None]),
             home_now=np.array(home_now, np.int64),
             appears=np.maximum(known.appears - self.now, 0),
             lapses=np.where(known.lapses >= NEVER, NEVER, known.lapses - self.now),
@@ -130,15 +130,15 @@ class State:
             solved=np.array(self.served_at, np.int64) >= 0,
             ends=np.maximum(np.array(self.ends, np.int64) - self.now, 0),
             limit=max(self.limit - self.now, 0), coming=coming,
-            middle=self._middle(self._spots) if coming else None,
-            middle_now=self._middle(here) if coming else None)
+            middle=self.middle(self._spots) if coming else None,
+            middle_now=self.middle(here) if coming else None)
 
     @property
     def _spots(self) -> Floats:
         """[M, 2] m."""
         return np.array([target.at for target in self.targets], float).reshape(-1, 2)
 
-    def _middle(self, spots: Floats) -> Int64 | None:
+    def middle(self, spots: Floats) -> Int64 | None:
         """[A] ms from places [A, 2] to where targets may be, in the mean, for the fastest; None
         where that is not said.
         """
@@ -147,10 +147,11 @@ class State:
             return None
         spread = places(np.array(area[:2]), np.array(area[2:]))
         mean = distances(spots, spread, self.problem.metric).mean(1)
-        return _ms(mean, max(agent.speed for agent in self.problem.agents))
+        return ms(mean, max(agent.speed for agent in self.problem.agents))
 
 
-def _ms(metres: Floats, speed: float | Floats) -> Int64:
+def ms(metres: Floats, speed: float | Floats) -> Int64:
+    """Whole milliseconds of ways at so many metres a second."""
     return np.rint(MS * metres / speed).astype(np.int64)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from moonteam.planners.seconds.base import MS, NEVER, Moment, closes, enough, opens
 from moonteam.planners.seconds.keeper import HOME, WAIT
-from moonteam.planners.unfolding.ground import Ground
+from moonteam.planners.unfolding.ground import Ground, Look
 from moonteam.planners.unfolding.state import Body, Order, Outcome, State
 from moonteam.planners.unfolding.ways import Floats, Way
 from moonteam.problem.timed import Agent, Place, Prospect, Target, Timed
@@ -43,6 +43,7 @@ class View:
     coming: int  # targets that are still to be known of
     ground: Ground | None  # what has been seen of where targets may be hidden
     state: State
+    looks: tuple[Look, ...] = ()  # places to look from, the last columns of `moment`
 
     def imagine(self, coming: Sequence[Target], lost: Sequence[float | None],
                 pace: np.ndarray | None = None) -> World:

@@ -1,0 +1,167 @@
+"""A policy that looks ahead, and places to look from."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from moonteam import loading, paths
+from moonteam.grid.macro import world as macro_world
+from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.planners.seconds.greedy import GreedyPlanner
+from moonteam.planners.seconds.local import LocalSearchPlanner
+from moonteam.planners.seconds.macro import problem_of
+from moonteam.planners.unfolding.ahead import LookingAhead, imagined, raced
+from moonteam.planners.unfolding.deciders import Replanning, play, play_together
+from moonteam.planners.unfolding.future import future
+from moonteam.planners.unfolding.pointing import Pointing
+from moonteam.planners.unfolding.search import with_looks
+from moonteam.planners.unfolding.world import World
+from moonteam.policies.policy import Policy
+
+POLICY = Policy.load(paths.find("unfolding", "policies", ".safetensors"))
+
+
+def missions(name, count):
+    return loading.load_set(paths.find(f"unfolding/{name}", "testsets", ".jsonl"))[:count]
+
+
+def later(problem, events):
+    """The mission after so many events, played by exact replanning."""
+    world, decider = World(problem), Replanning(ExactPlanner())
+    for _ in range(events):
+        world.step(decider.act(world.view()))
+    return world.view()
+
+
+def test_the_best_try_is_done_if_it_gains_more_than_its_error_and_the_worse_drop_out():
+    rng = np.random.default_rng(0)
+    luck = rng.normal(50.0, 20.0, 64)
+    costs = np.stack([luck, luck - 3.0 + rng.normal(0, 1, 64), luck + 5.0 + rng.normal(0, 1, 64)])
+    best, stays = raced(costs, usual=True)
+    assert best == 1
+    assert stays.tolist() == [False, True, False]
+    near = np.stack([luck, luck - 0.05 + rng.normal(0, 4, 64)])
+    assert raced(near, usual=True)[0] == 0
+    best, stays = raced(near, usual=False)
+    assert best == int(near.mean(1).argmin())
+    assert stays.all()
+
+
+@pytest.mark.parametrize(("name", "events"), [("following", 3), ("arrivals", 2), ("arrivals", 6)])
+def test_an_imagined_mission_is_the_one_in_which_that_future_was_known(name, events):
+    view = later(missions(name, 3)[2], events)
+    drawn = [future(view, np.random.default_rng(k)) for k in range(3)]
+    size = 12
+    problems = imagined(view, drawn, size)
+    left = np.flatnonzero(~view.moment.solved)
+    for row, one in enumerate(drawn):
+        whole = problem_of(one.world(view).revealed().view().moment)
+        rows = np.concatenate([left, len(view.targets) + np.arange(view.coming)])
+        own = jax.tree.map(lambda x, row=row: x[row], problems)
+        count = len(rows)
+        assert own.target_mask.tolist() == [k < count for k in range(size)]
+        near = {"rtol": 0, "atol": 1.1e-3}  # those are whole milliseconds
+        np.testing.assert_allclose(own.start[:, :count], whole.start[:, rows], **near)
+        np.testing.assert_allclose(own.between[:, :count, :count],
+                                   whole.between[:, rows][:, :, rows], **near)
+        for key in ("need", "either", "service", "lapses"):
+            np.testing.assert_array_equal(getattr(own, key)[:count], getattr(whole, key)[rows])
+        np.testing.assert_array_equal(own.has, whole.has)
+        assert own.unit == pytest.approx(float(whole.unit), rel=1e-3)
+        late = own.shown[len(left):count] if name == "arrivals" else own.following[len(left):count]
+        expected = [t.appears - view.now / 1000 for t in one.coming] if name == "arrivals" else (
+            np.arange(view.coming) + 1)
+        np.testing.assert_allclose(late, expected, atol=1e-3)
+
+
+def test_what_is_done_does_not_depend_on_who_plays_beside():
+    problems = missions("arrivals", 3)
+
+    def ends(some):
+        worlds = [World(one) for one in some]
+        play_together(worlds, LookingAhead(POLICY, 16).choose,
+                      [Replanning(ExactPlanner()) for _ in some])
+        return [(world.outcome.seconds, world.outcome.decisions) for world in worlds]
+
+    together = ends(problems)
+    assert ends(problems[1:2]) == together[1:2]
+
+
+def test_looking_ahead_for_what_waits_lets_targets_wait_less():
+    problems = missions("arrivals", 40)
+
+    def waits(choose):
+        worlds = [World(one) for one in problems]
+        play_together(worlds, choose, [Replanning(ExactPlanner()) for _ in problems])
+        assert all(world.outcome.success for world in worlds)
+        return np.mean([world.outcome.waited for world in worlds])
+
+    assert waits(LookingAhead(POLICY, 32, "waiting").choose) < 0.99 * waits(
+        Pointing(POLICY).choose)
+
+
+def test_from_the_places_to_look_from_all_that_is_unseen_can_be_seen():
+    world = World(missions("hidden", 1)[0])
+    view = with_looks(world.view())
+    sensor = view.agents[0].sensor
+    assert len(view.looks) >= 10
+    for look in view.looks:
+        assert np.hypot(*(look.unseen - look.at).T).max() <= sensor
+        there = np.array(look.from_afar(view.places[0], sensor))
+        assert np.hypot(*(look.unseen - there).T).max() <= sensor + 1e-9
+        assert np.hypot(*(there - view.places[0])) <= np.hypot(*(look.at - view.places[0])) + 1e-9
+    seen = np.concatenate([look.unseen for look in view.looks])
+    assert sorted(map(tuple, seen)) == sorted(map(tuple, world.state.ground.unseen))
+    # A column each, which needs one robot with eyes.
+    count, now = len(view.targets), view.moment
+    assert now.need[count:, -1].tolist() == [1] * len(view.looks)
+    assert not now.need[count:, :-1].any()
+    assert now.start[0, count:] == pytest.approx(
+        1000 * np.hypot(*(np.array([look.at for look in view.looks]) - view.places[0]).T)
+        / view.agents[0].speed, abs=1)
+
+
+@pytest.mark.parametrize("planner", [GreedyPlanner(), LocalSearchPlanner(iterations=500)])
+def test_hidden_targets_are_found_by_planning_where_to_look(planner):
+    for problem in missions("hidden", 3):
+        world = World(problem)
+        play(world, Replanning(planner, places=True))
+        assert world.outcome.success
+        assert world.outcome.seconds >= problem.optimal.bound - 0.02
+
+
+def test_a_policy_looks_for_hidden_targets_and_ahead_to_where_they_may_be():
+    problems = missions("hidden", 2)
+    for choose in (Pointing(POLICY).choose, LookingAhead(POLICY, 4).choose):
+        worlds = [World(one) for one in problems]
+        play_together(worlds, choose, [Replanning(ExactPlanner(), places=True) for _ in problems])
+        assert all(world.outcome.success for world in worlds)
+
+
+def test_a_hidden_target_is_known_once_somebody_has_looked_from_near_it():
+    view = with_looks(World(missions("hidden", 1)[0]).view())
+    drawn = [future(view, np.random.default_rng(5))]
+    problems = imagined(view, drawn, 24)
+    problem = jax.tree.map(lambda x: x[0], problems)
+    state = macro_world.reset(problem)
+    first = len(view.targets) + len(view.looks)
+    hidden = np.arange(24)[first:first + view.coming]
+    assert not np.asarray(macro_world.known(state))[hidden].any()
+    assert int(macro_world.coming(state)) == view.coming
+    for k in range(len(view.targets), first):
+        solved = np.zeros(24, bool)
+        solved[k] = True
+        seen = np.asarray(macro_world.known(replace(state, solved=solved)))[hidden]
+        near = [np.hypot(*(np.array(t.at) - view.looks[k - len(view.targets)].at)) <= 6.0
+                for t in drawn[0].coming]
+        assert seen.tolist() == near
+    everything = np.asarray(problem.looks) | ~np.asarray(problem.target_mask)
+    there = replace(state, solved=everything)
+    assert int(macro_world.coming(there)) == 0
+    # Nobody need look any more; who serves what was found ends it.
+    part = replace(state, solved=everything & (np.arange(24) != len(view.targets)))
+    if int(macro_world.coming(part)) == 0:
+        assert not np.asarray(macro_world.open_targets(part))[len(view.targets)]
+    assert bool(macro_world.finished(replace(state, solved=~np.asarray(problem.looks))))
