@@ -45,6 +45,8 @@ FIRST = 16
 """Futures in which all tries are played; then twice as many, and so on, with those still in it."""
 SURE = 2.0
 """Standard errors behind the best at which a try drops out."""
+FEWEST = 4
+"""T at least: programs for fewer would be compiled in vain."""
 ROWS = 512
 """R."""
 LONGEST = 64
@@ -153,7 +155,8 @@ class LookingAhead:
         """[tries, F] s, of the tries `left` of each mission, in `count` futures that they share."""
         sizes: dict[int, list[int]] = {}
         for b in left:
-            sizes.setdefault(macro.padded(len(asked[b].open_) + asked[b].view.coming), []).append(b)
+            targets = len(asked[b].open_) + asked[b].view.coming
+            sizes.setdefault(max(FEWEST, macro.padded(targets)), []).append(b)
         found = {}
         for size, missions in sizes.items():
             problems, rows, firsts, bounds = [], [], [], []
