@@ -60,6 +60,25 @@ def test_a_policy_plays_a_set_side_by_side_as_it_plays_one_mission():
     assert (side_by_side[1].seconds, side_by_side[1].decisions) == (alone.seconds, alone.decisions)
 
 
+def test_rows_over_futures_are_those_asked_for():
+    contenders = timed.contenders(Options(
+        ["exact", "policy"], policies=[paths.find("unfolding", "policies", ".safetensors")]))
+
+    def names(*words, **more):
+        return [row.name for row in unfolding.rows_of(contenders, *words, **more)]
+
+    exact, policy = "exact(makespan)", "policy(argmax)"
+    assert names([8], [], ["waiting"], ahead=True, foresee="policies") == [
+        exact, policy, f"{policy} over 8 futures, waiting"]
+    assert names([8], [], (), ahead=True, foresee="planners") == [
+        exact, f"{exact} over 8 futures", policy]
+    # Nobody but a policy looks ahead to places to look from.
+    assert names([8], ["sweep", "places"], (), ahead=True) == [
+        f"{exact}, sweep", f"{exact} over 8 futures, sweep", f"{exact}, places",
+        f"{policy}, sweep", f"{policy} over 8 futures, sweep", f"{policy}, places",
+        f"{policy} over 8 futures, places"]
+
+
 def test_failures_count_with_the_limit_and_their_cause_is_said(capsys):
     document = report(capsys, "unfolding/losses", "--limit", "60")
     failed = [row for row in document["rows"] if not row["success"]]
@@ -88,6 +107,8 @@ def test_a_third_of_the_missions_lose_one_robot():
 
 @pytest.mark.parametrize(("words", "says"), [
     (["3x5"], "3x5: is in steps"), (["--futures", "1"], "--futures: 1 is not allowed; 2 to 4096"),
+    (["--goal", "waiting"], "--goal: has no effect without --futures"),
+    (["--foresee", "policies"], "--foresee: has no effect without --futures"),
     (["--search", "sweep"], "--search: has no effect where no target is hidden"),
     (["--planner", "best"], "no such planner by the clock"),
     (["--decode", "sample"], "--decode: has no effect without --planner policy"),

@@ -44,7 +44,8 @@ class Args(Seeded, Limited, Resumable, Reported):
       moonteam evaluate unfolding unfolding/following --planner exact --planner greedy
       moonteam evaluate unfolding unfolding/arrivals --futures 16 --limit 100
       moonteam evaluate unfolding --planner policy --policy unfolding --futures 256 --limit 200
-      moonteam evaluate unfolding unfolding/arrivals --futures 64 --goal waiting --limit 100
+      moonteam evaluate unfolding unfolding/arrivals --planner exact --planner policy \
+        --policy unfolding --futures 64 --foresee policies --goal waiting --limit 100
       moonteam evaluate unfolding unfolding/hidden --search nearest --search sweep
       moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team_mappo
     """
@@ -57,6 +58,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     futures: Many[tuple[int, ...]] = ()
     """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
     themselves in the futures; where nothing but targets comes, thousands of them in one call."""
+    foresee: Literal["all", "policies", "planners"] = "all"
+    """Rows that are repeated over futures: all, those of policies, or those of other planners."""
     goal: Many[tuple[Goal, ...]] = ()
     """What is to be least over futures: makespan, or waiting, which is how long targets wait for
     their services; again for more rows. Default: makespan."""
@@ -85,8 +88,9 @@ def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
     hidden = any(target.hidden for one in found for target in one.targets)
     if args.search and not hidden:
         raise InputError("--search", "has no effect where no target is hidden")
-    if args.goal and not args.futures:
-        raise InputError("--goal", "has no effect without --futures")
+    for option, given in (("--goal", args.goal), ("--foresee", args.foresee != "all")):
+        if given and not args.futures:
+            raise InputError(option, "has no effect without --futures")
     others = any(one.expects is not None and (one.expects.loss is not None or one.expects.scatter)
                  for one in found)
     return found, hidden, not others
@@ -101,7 +105,7 @@ def run(args: Args) -> int:
     found, hidden, ahead = _missions(args)
     patterns = args.search or tuple(unfolding.PATTERNS) if hidden else ()
     rows = unfolding.rows_of(timed.contenders(options_of(args)), args.futures, patterns, args.goal,
-                             ahead)
+                             ahead, args.foresee)
     kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)
     title = f"{Path(args.set).stem}: {len(found)} missions that unfold"
     document = unfolding.evaluate(found, rows, args.seed, title,

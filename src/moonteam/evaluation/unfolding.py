@@ -158,11 +158,13 @@ class Played:
 
 
 def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
-            patterns: Sequence[str], goals: Sequence[Goal] = (), ahead: bool = False) -> list[Row]:
+            patterns: Sequence[str], goals: Sequence[Goal] = (), ahead: bool = False,
+            foresee: str = "all") -> list[Row]:
     """Every planner alone, then over so many futures, by every pattern of search.
 
     `ahead`: nothing but targets comes, so that policies can look ahead in the macro world; where
-    targets are hidden, in which there are places to look from.
+    targets are hidden, in which there are places to look from. `foresee` says whose rows are
+    repeated over futures: all, those of policies, or of other planners.
 
     Raises InputError for a number of futures that is none.
     """
@@ -173,6 +175,8 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
     for one in contenders:
         points = pointing(one.planner) is not None
         over = futures if not one.together or points else ()
+        if foresee != "all" and isinstance(one.planner, PolicyPlanner) != (foresee == "policies"):
+            over = ()
         for pattern in patterns or [""]:
             found += [Row(one, 0, pattern)]
             looks = ahead and points and pattern in ("", PLACES)
