@@ -11,6 +11,7 @@ from moonteam.commands import testsets_unfolding
 from moonteam.evaluation import timed, unfolding
 from moonteam.evaluation.contenders import Options
 from moonteam.planners.unfolding import draw
+from moonteam.problem.timed import Agent, Target, Timed
 from moonteam.report.intervals import Bootstrap
 
 
@@ -85,8 +86,24 @@ def test_failures_count_with_the_limit_and_their_cause_is_said(capsys):
     assert failed
     assert all(row["seconds"] == 300.0 and row["lost"] == 1 for row in failed)
     assert document["summary"][0]["success"] == 1 - len(failed) / 60
+    never = sum(map(unfolding.hopeless, loading.load_set(
+        paths.find("unfolding/losses", "testsets", ".jsonl"))[:60]))
+    assert 0 < never <= len(failed)
+    assert any(note.startswith(f"{never} missions nobody") for note in document["notes"])
     assert any(f"{len(failed)} x the robots that are left cannot serve target" in note
                for note in document["notes"])
+
+
+def test_missions_that_nobody_can_solve_are_told_apart():
+    """A robot that alone can drill, 20 m from where it must: lost before it is there, or after."""
+    def mission(lost):
+        agents = (Agent((0.0, 0.0), ("drill",), lost=lost), Agent((1.0, 0.0), ("eye",)))
+        return Timed("seconds", agents, (Target((20.0, 0.0), ("drill", "eye")),
+                                         Target((0.0, 5.0), ("eye",))))
+
+    assert unfolding.hopeless(mission(19.9))
+    assert not unfolding.hopeless(mission(20.1))
+    assert not unfolding.hopeless(mission(None))
 
 
 def test_the_bundled_sets_are_drawn_again_by_their_seed():

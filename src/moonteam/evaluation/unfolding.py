@@ -6,6 +6,7 @@ replanning where it is among them, mission by mission.
 
 from __future__ import annotations
 
+import itertools
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
-from moonteam.planners.seconds.base import TimedPlanner
+from moonteam.planners.seconds.base import MS, TimedPlanner, enough, moment
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.policy import PolicyPlanner
 from moonteam.planners.unfolding.ahead import LookingAhead
@@ -214,7 +215,7 @@ def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: s
              "Hindsight: the least makespan if all had been known from the start and nobody were "
              "lost; nobody can be faster.",
              "A target waits from when there is one until its service starts; hidden ones from the "
-             "mission's start.", *_causes(found)]
+             "mission's start.", *_solvable(problems, found), *_causes(found)]
     lacking = [row.name for row in rows[len(found):]]
     return {"title": title, "summary": [summary(row, played, first, bound, bootstrap)
                                         for row, played in found],
@@ -250,6 +251,33 @@ def _played(problems: Sequence[Timed], row: Row, seed: int, kept: Kept) -> list[
         return kept.once(("all",), list[Played], lambda: row.play_all(problems, seed))
     return [kept.once((str(i),), Played, lambda i=i: row.play(problems[i], i, seed))
             for i in track(range(len(problems)), row.name, len(problems))]
+
+
+def hopeless(problem: Timed) -> bool:
+    """Whether a robot is lost before it could have been where the team needs it, by any plan."""
+    lost = [(i, agent.lost) for i, agent in enumerate(problem.agents) if agent.lost is not None]
+    first, everybody = moment(problem), range(len(problem.agents))
+    for i, at in lost:
+        rest = [k for k in everybody if k != i]
+        for j in range(len(problem.targets)):
+            if enough(rest, j, first):
+                continue
+            teams = (team for size in everybody for team in itertools.combinations(rest, size)
+                     if enough([i, *team], j, first))
+            if min(int(first.start[[i, *team], j].max()) for team in teams) > MS * at:
+                return True
+    return False
+
+
+def _solvable(problems: Sequence[Timed], found: Sequence[tuple[Row, list[Played]]]) -> list[str]:
+    """How many missions nobody could have solved, and the rate among the others."""
+    never = np.array([hopeless(problem) for problem in problems])
+    if not never.any():
+        return []
+    return [f"{never.sum()} missions nobody could have solved: a robot is lost before it could "
+            "have been where the team needs it. Of the others: " + ", ".join(
+                f"{row.name} {np.mean([one.success for one in played], where=~never):.3f}"
+                for row, played in found) + "."]
 
 
 def _causes(found: Sequence[tuple[Row, list[Played]]]) -> list[str]:

@@ -87,7 +87,7 @@ class MacroState:
     solved: Array  # [M] bool; padded targets count as solved
     since: Array  # [N] s, when it last became free
     travelled: Array  # [N] s
-    begun: Array  # [] s at which services started, added up
+    served: Array  # [M] s at which each service started; 0 before
 
 
 @jax.tree_util.register_dataclass

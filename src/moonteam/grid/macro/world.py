@@ -34,7 +34,7 @@ def reset(problem: MacroProblem) -> MacroState:
         problem=problem, now=jnp.zeros((), jnp.float32), node=none, origin=none, leg=zero,
         goal=none, busy=problem.free, serving=jnp.zeros(targets, bool),
         solved=~problem.target_mask, since=problem.free, travelled=zero,
-        begun=jnp.zeros((), jnp.float32))
+        served=jnp.zeros(targets, jnp.float32))
     return _run(start, jnp.any(free(start)))[0]
 
 
@@ -310,7 +310,7 @@ def _start(state: MacroState) -> MacroState:
         state, serving=state.serving | (starts & ~at_once), solved=state.solved | at_once,
         busy=jnp.where(serves, problem.service[here], state.busy),
         goal=jnp.where(ends, targets, state.goal), since=jnp.where(ends, state.now, state.since),
-        begun=state.begun + state.now * jnp.sum(starts & ~problem.looks))
+        served=jnp.where(starts, state.now, state.served))
 
 
 def _advance(state: MacroState) -> tuple[MacroState, Array]:

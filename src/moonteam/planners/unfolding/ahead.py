@@ -28,7 +28,7 @@ from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.planners import macro
 from moonteam.planners.seconds.base import MS
 from moonteam.planners.seconds.keeper import WAIT
-from moonteam.planners.unfolding.deciders import GOALS, Goal
+from moonteam.planners.unfolding.deciders import NOT_DONE, Goal
 from moonteam.planners.unfolding.future import Future, future
 from moonteam.planners.unfolding.pointing import begun, bound_of, problem_in
 from moonteam.planners.unfolding.state import distances
@@ -50,7 +50,7 @@ FEWEST = 4
 ROWS = 512
 """R."""
 LONGEST = 64
-"""Decisions after which a rollout is given up, with twice its limit."""
+"""Decisions after which a rollout is given up."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class LookingAhead:
 
     Args:
       policy: of kind pointer.
-      futures: F, the most that are drawn at a moment.
+      futures: F, the most that are drawn at a moment; one where no more targets come.
       goal: what counts in a future: its makespan, or how long targets wait for their services.
       seed: of the draws.
       preference: 0 time .. 1 effort, of the policy.
@@ -85,7 +85,7 @@ class LookingAhead:
     def __init__(self, policy: Policy, futures: int, goal: Goal = "makespan", seed: int = 0,
                  preference: float = 0.0):
         self._spec, self._params = macro.spec_of(policy), policy.params
-        self._futures, self._goal, self._seed = futures, GOALS.index(goal), seed
+        self._futures, self._goal, self._seed = futures, goal, seed
         self._preference = np.float32(preference)
 
     def choose(self, views: Sequence[View]) -> list[np.ndarray]:
@@ -139,7 +139,8 @@ class LookingAhead:
                 best, stays = raced(costs[b], bool(left[b][0] == 0))
                 chosen[b] = int(left[b][best])
                 left[b], costs[b] = left[b][stays], costs[b][stays]
-                if len(left[b]) == 1 or played >= self._futures:
+                sure = costs[b].shape[1] == 1
+                if sure or len(left[b]) == 1 or played >= self._futures:
                     del left[b]
             count = min(played, self._futures - played)
         found = []
@@ -152,41 +153,56 @@ class LookingAhead:
 
     def _costs(self, asked: list[_Asked], left: dict[int, np.ndarray],
                count: int) -> dict[int, np.ndarray]:
-        """[tries, F] s, of the tries `left` of each mission, in `count` futures that they share."""
-        sizes: dict[int, list[int]] = {}
+        """[tries, F] s, of the tries `left` of each mission, in futures that they share.
+
+        So many as `count`, but one where nothing is drawn.
+        """
+        alike: dict[tuple[int, ...], list[int]] = {}
         for b in left:
-            targets = len(asked[b].open_) + asked[b].view.coming
-            sizes.setdefault(max(FEWEST, macro.padded(targets)), []).append(b)
+            coming = asked[b].view.coming
+            size = max(FEWEST, macro.padded(len(asked[b].open_) + coming))
+            team = asked[b].view.moment.has.shape
+            alike.setdefault((size, count if coming else 1, *team), []).append(b)
         found = {}
-        for size, missions in sizes.items():
+        for (size, some, *_), missions in alike.items():
             problems, rows, firsts, bounds = [], [], [], []
             for b in missions:
                 one = asked[b]
-                base = len(problems) * count
+                base = len(problems) * some
                 problems.append(imagined(one.view, [future(one.view, one.rng)
-                                                    for _ in range(count)], size))
+                                                    for _ in range(some)], size))
                 tries = one.tries[left[b]]
-                rows.append(np.tile(base + np.arange(count), len(tries)))
-                firsts.append(np.repeat(np.where(tries < len(one.open_), tries, size), count, 0))
-                bounds.append(np.tile(one.bound, (len(tries) * count, 1)))
+                rows.append(np.tile(base + np.arange(some), len(tries)))
+                firsts.append(np.repeat(np.where(tries < len(one.open_), tries, size), some, 0))
+                bounds.append(np.tile(one.bound, (len(tries) * some, 1)))
             whole: MacroProblem = jax.tree.map(lambda *x: np.concatenate(x), *problems)
-            costs = self._rolled(whole, *(np.concatenate(x) for x in (rows, firsts, bounds)))
-            ends = np.cumsum([len(row) for row in rows])
-            for b, own in zip(missions, np.split(costs, ends[:-1]), strict=True):
-                found[b] = own.reshape(-1, count)
+            span, served = self._rolled(whole, *(np.concatenate(x)
+                                                 for x in (rows, firsts, bounds)))
+            ends = np.cumsum([len(row) for row in rows])[:-1]
+            for b, own, starts in zip(missions, np.split(span, ends), np.split(served, ends),
+                                      strict=True):
+                found[b] = self._cost(asked[b], own, starts).reshape(-1, some)
         return found
 
+    def _cost(self, asked: _Asked, span: np.ndarray, served: np.ndarray) -> np.ndarray:
+        """[rollouts] s that count, of a mission's makespans and its services' starts [., T]."""
+        count = len(asked.open_) + asked.view.coming
+        return served[:, :count].sum(1) if self._goal == "waiting" else span
+
     def _rolled(self, problems: MacroProblem, row: np.ndarray, first: np.ndarray,
-                bound: np.ndarray) -> np.ndarray:
-        """[rollouts] s; of each its problem's row, what everybody does first, who is bound."""
+                bound: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[rollouts] s to the end and [rollouts, T] s to each service; of each its problem's row,
+        what everybody does first, who is bound.
+        """
         found = []
         for at in range(0, len(row), ROWS):
             own = np.minimum(np.arange(at, at + ROWS), len(row) - 1)
             part = jax.tree.map(lambda x, own=own: x[row[own]], problems)
-            both = _played(self._spec, self._params, part, bound[own],
-                           first[own].astype(np.int32), self._preference)
-            found.append(both[self._goal])
-        return np.concatenate(jax.device_get(found))[:len(row)].astype(np.float64)
+            found.append(_played(self._spec, self._params, part, bound[own],
+                                 first[own].astype(np.int32), self._preference))
+        span, served = (np.concatenate(x)[:len(row)].astype(np.float64)
+                        for x in zip(*jax.device_get(found), strict=True))
+        return span, served
 
 
 def raced(costs: np.ndarray, usual: bool) -> tuple[int, np.ndarray]:
@@ -198,6 +214,8 @@ def raced(costs: np.ndarray, usual: bool) -> tuple[int, np.ndarray]:
     root = math.sqrt(costs.shape[1])
     best = int(costs.mean(1).argmin())
     behind = costs - costs[best]
+    if costs.shape[1] == 1:  # nothing is left to luck
+        return best, behind[:, 0] <= 0.0
     stays = behind.mean(1) <= SURE * behind.std(1, ddof=1) / root
     if usual and behind[0].mean() <= behind[0].std(ddof=1) / root:
         best = 0
@@ -296,29 +314,29 @@ def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
 def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, first: Array,
             preference: Array) -> tuple[Array, Array]:
     """[R] s from now to the end, if the team does `first` [R, N] and then what is likeliest; and
-    the seconds at which its services start, added up.
+    [R, T] s at which each service starts.
     """
     begin = begun(problems, bound)
-    worst = 2.0 * problems.limit
+    worst = NOT_DONE * problems.limit
 
     def go(carry: tuple, choice: Array) -> tuple:
-        states, over, (cost, starts), turn = carry
+        states, over, cost, turn = carry
         result = jax.vmap(world.step)(states, choice)
         after = jax.vmap(world.loosen)(result.state, jnp.ones(choice.shape, bool))
         end = jnp.where(result.terminated, states.now + result.seconds, worst)
         ended = over | result.terminated | result.truncated
         cost = jnp.where(ended & ~over, end, cost)
-        late = after.begun + worst * jnp.sum(~after.solved & ~after.serving, axis=-1)
-        starts = jnp.where(ended & ~over, late, starts)
-        return trees.where(ended, states, after), ended, (cost, starts), turn + 1
+        return trees.where(over, states, after), ended, cost, turn + 1
 
     def likeliest(carry: tuple) -> tuple:
         logits = _said(spec, params, carry[0], preference)
         return go(carry, jax.vmap(world.choose)(carry[0], logits, jnp.zeros_like(logits))[0])
 
-    start = go((begin, jnp.zeros(first.shape[0], bool), (worst, worst), 0), first)
-    return cast(tuple[Array, Array], jax.lax.while_loop(
-        lambda carry: jnp.any(~carry[1]) & (carry[3] < LONGEST), likeliest, start)[2])
+    start = go((begin, jnp.zeros(first.shape[0], bool), worst, 0), first)
+    end, _, cost, _ = jax.lax.while_loop(
+        lambda carry: jnp.any(~carry[1]) & (carry[3] < LONGEST), likeliest, start)
+    late = ~end.solved & ~end.serving
+    return cost, jnp.where(late, worst[:, None], end.served)
 
 
 def _said(spec: PointerSpec, params: Any, states: MacroState, preference: Array) -> Array:
