@@ -77,18 +77,15 @@ def test_an_imagined_mission_is_the_one_in_which_that_future_was_known(name, eve
 
 
 def test_what_is_done_does_not_depend_on_who_plays_beside():
-    problems = missions("arrivals", 3)
-
-    def ends(some):
-        worlds = [World(one) for one in some]
-        play_together(worlds, LookingAhead(POLICY, 16).choose,
-                      [Replanning(ExactPlanner()) for _ in some])
-        return [(world.outcome.seconds, world.outcome.decisions) for world in worlds]
-
-    together = ends(problems)
-    assert ends(problems[1:2]) == together[1:2]
+    views = [later(one, 3) for one in missions("following", 2)]
+    choose = LookingAhead(POLICY, 32).choose
+    together = choose(views)
+    for view, chosen in zip(views, together, strict=True):
+        assert choose([view])[0].tolist() == chosen.tolist()
+    assert choose([views[1], views[0], views[1]])[2].tolist() == together[1].tolist()
 
 
+@pytest.mark.soak
 def test_looking_ahead_for_what_waits_lets_targets_wait_less():
     problems = missions("arrivals", 40)
 
@@ -134,10 +131,14 @@ def test_hidden_targets_are_found_by_planning_where_to_look(planner):
 
 def test_a_policy_looks_for_hidden_targets_and_ahead_to_where_they_may_be():
     problems = missions("hidden", 2)
-    for choose in (Pointing(POLICY).choose, LookingAhead(POLICY, 4).choose):
-        worlds = [World(one) for one in problems]
-        play_together(worlds, choose, [Replanning(ExactPlanner(), places=True) for _ in problems])
-        assert all(world.outcome.success for world in worlds)
+    worlds = [World(one) for one in problems]
+    play_together(worlds, Pointing(POLICY).choose,
+                  [Replanning(ExactPlanner(), places=True) for _ in problems])
+    assert all(world.outcome.success for world in worlds)
+    view = with_looks(World(problems[0]).view())
+    (chosen,) = LookingAhead(POLICY, 2).choose([view])
+    assert (chosen >= len(view.targets)).any()  # somebody looks
+    assert (chosen < len(view.moment.solved)).all()
 
 
 def test_a_hidden_target_is_known_once_somebody_has_looked_from_near_it():

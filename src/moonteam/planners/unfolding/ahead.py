@@ -47,8 +47,8 @@ SURE = 2.0
 """Standard errors behind the best at which a try drops out."""
 FEWEST = 4
 """T at least: programs for fewer would be compiled in vain."""
-ROWS = 512
-"""R."""
+FEW, ROWS = 64, 512
+"""R, of few rollouts and of many."""
 LONGEST = 64
 """Decisions after which a rollout is given up."""
 
@@ -194,9 +194,9 @@ class LookingAhead:
         """[rollouts] s to the end and [rollouts, T] s to each service; of each its problem's row,
         what everybody does first, who is bound.
         """
-        found = []
-        for at in range(0, len(row), ROWS):
-            own = np.minimum(np.arange(at, at + ROWS), len(row) - 1)
+        found, rows = [], ROWS if len(row) > 2 * FEW else FEW
+        for at in range(0, len(row), rows):
+            own = np.minimum(np.arange(at, at + rows), len(row) - 1)
             part = jax.tree.map(lambda x, own=own: x[row[own]], problems)
             found.append(_played(self._spec, self._params, part, bound[own],
                                  first[own].astype(np.int32), self._preference))
