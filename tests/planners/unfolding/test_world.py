@@ -235,3 +235,20 @@ def test_choosing_over_futures_waits_for_what_is_sure_to_come():
     goes, _ = played(problem, OverFutures(ExactPlanner(), 8))
     assert waits.outcome.seconds == pytest.approx(40.0)
     assert goes.outcome.seconds == pytest.approx(21.0)
+
+
+def test_who_waits_until_another_is_there_is_asked_again_then():
+    """The second goes only once the first has come, which is no news to anybody else."""
+    problem = mission([Agent((0.0, 0.0), ("A",)), Agent((9.0, 0.0), ("B",))],
+                      [Target((3.0, 0.0), ("A", "B"))])
+    world = World(problem)
+    world.step([0, -1])
+    assert (world.state.now, world.over) == (3000, False)
+    world.step([0, 0])
+    assert world.outcome.success
+    assert world.outcome.seconds == 9.0
+    world = World(problem)
+    world.step([0, -1])
+    world.step([0, -1])
+    assert world.over
+    assert world.outcome.reason == "nothing can happen any more"

@@ -117,12 +117,16 @@ class World:
         self.outcome.decisions += 1
         for i, order in enumerate(orders):
             self._tell(i, order)
-        self._due = False
+        self._due, began = False, self.state.now
         self._settle()
         while not self.over and not self._due:
             following = self._next()
             if following >= NEVER:
-                self._end("nothing can happen any more")
+                # Who waited for others to be where they are now is asked once more.
+                self._due = self.state.now > began and any(
+                    body.phase == "free" for body in self.state.bodies)
+                if not self._due:
+                    self._end("nothing can happen any more")
             elif following > self.state.limit:
                 self._advance(self.state.limit)
                 self._end(f"not done within {self.state.limit / MS:g} s")
