@@ -85,6 +85,18 @@ def test_what_is_done_does_not_depend_on_who_plays_beside():
     assert choose([views[1], views[0], views[1]])[2].tolist() == together[1].tolist()
 
 
+def test_nobody_waits_for_a_place_to_look_from():
+    view = with_looks(World(missions("hidden", 1)[0]).view())
+    ahead = LookingAhead(POLICY, 2, "waiting")
+    (asked,) = ahead._ask([view], 1)
+    first = len(view.targets) + len(view.looks)
+    served = np.zeros((1, 24))
+    served[0, :len(view.targets)], served[0, len(view.targets):first] = 3.0, 1000.0
+    served[0, first:first + view.coming] = 5.0
+    total = 3.0 * len(view.targets) + 5.0 * view.coming
+    assert ahead._cost(asked, np.ones(1), served).tolist() == [total]
+
+
 @pytest.mark.soak
 def test_looking_ahead_for_what_waits_lets_targets_wait_less():
     problems = missions("arrivals", 40)

@@ -186,8 +186,10 @@ class LookingAhead:
 
     def _cost(self, asked: _Asked, span: np.ndarray, served: np.ndarray) -> np.ndarray:
         """[rollouts] s that count, of a mission's makespans and its services' starts [., T]."""
-        count = len(asked.open_) + asked.view.coming
-        return served[:, :count].sum(1) if self._goal == "waiting" else span
+        if self._goal == "makespan":
+            return span
+        first, targets = len(asked.open_), np.flatnonzero(asked.open_ < len(asked.view.targets))
+        return served[:, [*targets, *range(first, first + asked.view.coming)]].sum(1)
 
     def _rolled(self, problems: MacroProblem, row: np.ndarray, first: np.ndarray,
                 bound: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
