@@ -30,10 +30,9 @@ from moonteam.planners.seconds.base import MS
 from moonteam.planners.seconds.keeper import WAIT
 from moonteam.planners.unfolding.deciders import NOT_DONE, Goal
 from moonteam.planners.unfolding.future import Future, future
-from moonteam.planners.unfolding.pointing import begun, bound_of, problem_in
+from moonteam.planners.unfolding.pointing import begun, moments, problem_in, said
 from moonteam.planners.unfolding.state import distances
 from moonteam.planners.unfolding.world import View
-from moonteam.policies import pointer
 from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.policy import Policy
 
@@ -99,11 +98,8 @@ class LookingAhead:
     def _ask(self, views: list[View], size: int) -> list[_Asked]:
         """What the policy could do at each moment [B]; calls are filled up to `size`."""
         filled = views + views[:1] * (size - len(views))
-        problems = macro.stacked([problem_in(view) for view in filled])
+        problems, bound = moments(filled)
         targets = problems.service.shape[1]
-        bound = np.full(problems.free.shape, -1, np.int32)
-        for row, view in zip(bound, filled, strict=True):
-            row[:len(view.places)] = bound_of(view)
         rngs = [self._rng(view) for view in views]
         seeds = np.zeros(size, np.uint32)
         seeds[:len(views)] = [rng.integers(2**32) for rng in rngs]
@@ -303,7 +299,7 @@ def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
            preference: Array) -> Array:
     """[B, K, N] int32 joint choices, the likeliest first; see `pointing`."""
     states = begun(problems, bound)
-    logits = _said(spec, params, states, preference)
+    logits = said(spec, params, states, preference)
 
     def tried(state: MacroState, logits: Array, seed: Array) -> Array:
         noise = HEAT * jax.random.gumbel(jax.random.key(seed), (TRIES, *logits.shape))
@@ -331,7 +327,7 @@ def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array
         return trees.where(over, states, after), ended, cost, turn + 1
 
     def likeliest(carry: tuple) -> tuple:
-        logits = _said(spec, params, carry[0], preference)
+        logits = said(spec, params, carry[0], preference)
         return go(carry, jax.vmap(world.choose)(carry[0], logits, jnp.zeros_like(logits))[0])
 
     start = go((begin, jnp.zeros(first.shape[0], bool), worst, 0), first)
@@ -339,9 +335,3 @@ def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array
         lambda carry: jnp.any(~carry[1]) & (carry[3] < LONGEST), likeliest, start)
     late = ~end.solved & ~end.serving
     return cost, jnp.where(late, worst[:, None], end.served)
-
-
-def _said(spec: PointerSpec, params: Any, states: MacroState, preference: Array) -> Array:
-    """Logits of each of a batch of moments."""
-    liking = jnp.broadcast_to(preference, states.now.shape)
-    return pointer.point(params, spec, jax.vmap(pointer.look)(states, liking)).logits

@@ -39,10 +39,7 @@ class Pointing:
 
     def choose(self, views: Sequence[View]) -> list[np.ndarray]:
         """[B] of [N] int64: a target's number or WAIT."""
-        problems = macro.stacked([problem_in(view) for view in views])
-        bound = np.full(problems.free.shape, -1, np.int32)
-        for row, view in zip(bound, views, strict=True):
-            row[:len(view.places)] = bound_of(view)
+        problems, bound = moments(views)
         found = np.asarray(_point(self._spec, self._params, problems, bound, self._preference))
         chosen = []
         for row, own, view in zip(found, bound, views, strict=True):
@@ -52,13 +49,22 @@ class Pointing:
         return chosen
 
 
+def moments(views: Sequence[View]) -> tuple[MacroProblem, np.ndarray]:
+    """What is known in several missions as one stack, [B]; and who is bound where, [B, N] int32."""
+    problems = macro.stacked([problem_in(view) for view in views])
+    bound = np.full(problems.free.shape, -1, np.int32)
+    for row, view in zip(bound, views, strict=True):
+        row[:len(view.places)] = _bound(view)
+    return problems, bound
+
+
 def problem_in(view: View) -> MacroProblem:
     """What is known as a problem of the macro world (NumPy arrays)."""
     problem = problem_of(view.moment)
     return replace(problem, looks=np.arange(len(problem.looks)) >= len(view.targets))
 
 
-def bound_of(view: View) -> list[int]:
+def _bound(view: View) -> list[int]:
     """[N] the open target at which each robot waits; -1 of the others."""
     return [body.goal if body.phase == "there" and isinstance(body.goal, int) and body.goal >= 0
             and not view.moment.solved[body.goal] else -1 for body in view.state.bodies]
@@ -72,12 +78,17 @@ def begun(problems: MacroProblem, bound: Array) -> MacroState:
     return replace(states, goal=goal, node=node)
 
 
+def said(spec: PointerSpec, params: Any, states: MacroState, preference: Array) -> Array:
+    """Logits [B, N, M + 1] of each of a batch of moments."""
+    liking = jnp.broadcast_to(preference, states.now.shape)
+    return pointer.point(params, spec, jax.vmap(pointer.look)(states, liking)).logits
+
+
 @partial(jax.jit, static_argnames="spec")
 def _point(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
            preference: Array) -> Array:
     """[B, N] int32 choices; M for waiting, and of those `bound` [B, N] to a target already."""
     states = begun(problems, bound)
-    liking = jnp.broadcast_to(preference, states.now.shape)
-    logits = pointer.point(params, spec, jax.vmap(pointer.look)(states, liking)).logits
+    logits = said(spec, params, states, preference)
     choice, _ = jax.vmap(world.choose)(states, logits, jnp.zeros_like(logits))
     return choice
