@@ -102,7 +102,7 @@ class Fused:
         problems, _ = scenarios.stack([scenarios.to_problem(mission) for mission in missions])
         poses = np.asarray(starts, np.float32)
         poses = np.broadcast_to(poses, (len(missions), poses.shape[-1]))
-        return (self.backend.model, self.backend.scene.surface, params, _charted(problems),
+        return (self.backend.model, self.backend.ground, params, _charted(problems),
                 self.backend.reset(poses))
 
     def _program(self, arguments: tuple[Any, ...]) -> jax.stages.Compiled:
@@ -124,7 +124,7 @@ def _charted(problems: Problem) -> Problem:
     return replace(problems, passable=jnp.ones((batch, kinds, height, width), bool))
 
 
-def _run(setup: Setup, decider: Decider, advance: Any, model: Any, surface: Any, params: Any,
+def _run(setup: Setup, decider: Decider, advance: Any, model: Any, ground: Any, params: Any,
          problems: Problem, worlds: WorldState) -> Outcome:
     """The loop over looks; all arrays have the leading axis B."""
     batch, robots = problems.agent_mask.shape
@@ -145,7 +145,7 @@ def _run(setup: Setup, decider: Decider, advance: Any, model: Any, surface: Any,
         progress = carry.progress
         active = progress.status == UNDER_WAY
         commands = jax.vmap(partial(command, setup))(progress)
-        worlds, log = advance(model, surface, carry.worlds, commands, setup.rules.chunk_steps)
+        worlds, log = advance(model, ground, carry.worlds, commands, setup.rules.chunk_steps)
         after = jax.vmap(partial(observe, setup))(problems, charted, progress, log.qpos)
         gone = worlds.diverged & (after.status == UNDER_WAY)
         after = after._replace(status=jnp.where(gone, ENGINE, after.status))

@@ -25,6 +25,9 @@ from mujoco.batch import Batch
 
 from moonteam import trees
 from moonteam.physics import mjx
+from moonteam.physics.regolith.bed import Bed
+from moonteam.physics.regolith.forces import Memory, soil_forces
+from moonteam.physics.regolith.treads import FELT_FIELDS, WIDTH, Treads, felt_of, radii
 from moonteam.physics.scene import Scene, SceneRobot
 from moonteam.robots.base import CONTROL_PERIOD, Command
 from moonteam.terrain.surface import Surface
@@ -46,6 +49,8 @@ class WorldState(NamedTuple):
     warmstart: Array  # [B, nv] the contact solver's last accelerations
     diverged: Array  # [B] bool: not a number or far too fast; the world is frozen since
     control: Controls
+    soil: Array  # [B, C, 4] what soil that gives way remembers of each tread: `Memory`
+    felt: Array  # [B, C, 25] what treads did in the last physics step: `Felt`
 
 
 class Log(NamedTuple):
@@ -54,6 +59,14 @@ class Log(NamedTuple):
     qpos: Array  # [B, T, nq] at the end of the sample's interval
     power: Array  # [B, T, R] W, mean over the interval
     propellant_rate: Array  # [B, T, R] kg/s, mean over the interval
+    treads: Array  # [B, T, C, 3] slip, sinkage m and load N, means over the interval; C = 0: rigid
+
+
+class Ground(NamedTuple):
+    """What worlds stand on, as MJX's programs take it."""
+
+    surface: Surface
+    bed: Bed | None  # None: rigid
 
 
 class Backend(Protocol):
@@ -133,6 +146,17 @@ def _call_controllers(
     return ctrl, tuple(states), jnp.stack(power), jnp.stack(propellant)
 
 
+def _soil(bed: Bed, surface: Surface, memory: Array, felt: Array
+          ) -> tuple[Array, Array, Array, Array]:
+    """Soil of one world: from memory [C, 4] and what is felt [C, WIDTH] the forces on the treads'
+    bodies [C, 6], the radii of their spheres [C], the new memory, and what is told of it [C, 3].
+    """
+    before = Memory(memory[:, :2], memory[:, 2], memory[:, 3])
+    forces, after, told = soil_forces(bed, surface, before, felt_of(felt))
+    kept = jnp.concatenate([after.moved, after.depth[:, None], after.load[:, None]], axis=1)
+    return forces, radii(bed, after.depth), kept, jnp.stack(told, axis=1)
+
+
 def _bad(qpos: Array, qvel: Array) -> Array:
     """Whether a world [..., nq], [..., nv] has blown up: bool [...]."""
     finite = jnp.isfinite(qpos).all(axis=-1) & jnp.isfinite(qvel).all(axis=-1)
@@ -182,8 +206,7 @@ class MjxBackend:
         key = self._key(state.qpos.shape[0], num_control_steps)
         if key not in self._programs:
             self.compile(*key)
-        return self._programs[key](self.model, self.scene.surface, _strong(state),
-                                   _strong(commands))
+        return self._programs[key](self.model, self.ground, _strong(state), _strong(commands))
 
     def compile(self, batch: int, num_control_steps: int) -> float:
         """Compiles that size of advance; returns the seconds it took."""
@@ -192,66 +215,84 @@ class MjxBackend:
         begun = time.perf_counter()
         advance = jax.jit(self.traced, static_argnames="num_control_steps")
         self._programs[key] = advance.lower(
-            self.model, self.scene.surface, state, commands,
+            self.model, self.ground, state, commands,
             num_control_steps=num_control_steps).compile(in_order())
         return time.perf_counter() - begun
+
+    @property
+    def ground(self) -> Ground:
+        """The scene's, to be handed to `traced`."""
+        return Ground(self.scene.surface, self.scene.bed)
 
     def _key(self, batch: int, num_control_steps: int) -> tuple[int, int]:
         _check_steps(num_control_steps, self.log_every)
         return batch, num_control_steps
 
-    def traced(self, model: mjx.Model, surface: Surface, state: WorldState,
+    def traced(self, model: mjx.Model, ground: Ground, state: WorldState,
                commands: Commands, num_control_steps: int) -> tuple[WorldState, Log]:
         """`advance` as a pure function of model and ground, to be part of a larger program."""
         def sample(worlds: WorldState, _: None) -> tuple[WorldState, Log]:
-            def step(carry: WorldState, _: None) -> tuple[WorldState, tuple[Array, Array]]:
+            def step(carry: WorldState, _: None) -> tuple[WorldState, tuple[Array, Array, Array]]:
                 return jax.vmap(self._control_step, in_axes=(None, None, 0, 0))(
-                    model, surface, carry, commands)
+                    model, ground, carry, commands)
 
-            worlds, (power, propellant) = jax.lax.scan(
-                step, worlds, None, length=self.log_every)
-            return worlds, Log(worlds.qpos, power.mean(axis=0), propellant.mean(axis=0))
+            worlds, told = jax.lax.scan(step, worlds, None, length=self.log_every)
+            return worlds, Log(worlds.qpos, *(x.mean(axis=0) for x in told))
 
         state, log = jax.lax.scan(
             sample, state, None, length=num_control_steps // self.log_every)
         return _strong(state), jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), log)
 
-    def _control_step(self, model: mjx.Model, surface: Surface, world: WorldState,
-                      commands: Commands) -> tuple[WorldState, tuple[Array, Array]]:
+    def _control_step(self, model: mjx.Model, ground: Ground, world: WorldState,
+                      commands: Commands) -> tuple[WorldState, tuple[Array, Array, Array]]:
         """One control step of one world; a diverged world stays as it is."""
         ctrl, controls, power, propellant = _call_controllers(
-            self.scene.robots, self.scene.model.nu, surface, world.time, world.qpos, world.qvel,
-            world.control, commands)
+            self.scene.robots, self.scene.model.nu, ground.surface, world.time, world.qpos,
+            world.qvel, world.control, commands)
+        treads, soil, told = self.scene.treads, world.soil, jnp.zeros((0, 3))
         # MJX broadcasts freely; only our own code is held to explicit ranks.
         with jax.numpy_rank_promotion("allow"):
             data = self._blank.replace(
                 time=world.time, qpos=world.qpos, qvel=world.qvel, act=world.act,
                 qacc_warmstart=world.warmstart, ctrl=ctrl)
+            if ground.bed is not None:
+                forces, size, soil, told = _soil(ground.bed, ground.surface, soil, world.felt)
+                data = data.replace(xfrc_applied=data.xfrc_applied.at[treads.bodies].add(forces))
+                model = model.replace(geom_size=model.geom_size.at[treads.geoms, 0].set(size))
             data = jax.lax.fori_loop(
                 0, self._substeps, lambda _, d: mjx.step(model, d), data)
+            felt = world.felt if ground.bed is None else treads.felt(data, jnp)
         bad = _bad(data.qpos, data.qvel)
         moved = WorldState(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart,
-                           jnp.zeros((), bool), controls)
+                           jnp.zeros((), bool), controls, soil, felt)
         stopped = world._replace(qvel=jnp.zeros_like(world.qvel), diverged=jnp.ones((), bool))
         frozen = world.diverged | bad
+        spent = (power, propellant, told)
         return (trees.where(frozen, stopped, moved),
-                (trees.where(frozen, jnp.zeros_like(power), power),
-                 trees.where(frozen, jnp.zeros_like(propellant), propellant)))
+                trees.where(frozen, jax.tree.map(jnp.zeros_like, spent), spent))
 
 
-def _control_world(scene: Scene, memories: Any, orders: Any, surface: Surface, seen: Array,
+def _control_world(scene: Scene, memories: Any, orders: Any, ground: Ground, seen: Array,
                    memory: Array, told: Array) -> tuple[Array, Array]:
-    """One world: seen [1 + nq + nv], controllers' memory and commands side by side, which have the
-    shapes of `memories` and `orders`.
+    """One world: seen [1 + nq + nv + C WIDTH], the memory of controllers and soil and the commands
+    side by side, which have the shapes of `memories` and `orders`.
 
-    Returns ctrl, power and propellant side by side [nu + 2 R], and the new memory.
+    Returns ctrl, power, propellant, what is told of the treads, the soil's forces and the treads'
+    radii side by side [nu + 2 R + (3 + 6 + 1) C], and the new memory.
     """
-    now, qpos, qvel = jnp.split(seen, (1, 1 + scene.model.nq))
+    nq, nv = scene.model.nq, scene.model.nv
+    now, qpos, qvel, felt = jnp.split(seen, (1, 1 + nq, 1 + nq + nv))
+    before, soil = _shaped(memories, memory)
     ctrl, controls, power, propellant = _call_controllers(
-        scene.robots, scene.model.nu, surface, now[0], qpos, qvel,
-        _shaped(memories, memory), _shaped(orders, told))
-    leaves = [leaf.reshape(-1).astype(jnp.float32) for leaf in jax.tree.leaves(controls)]
-    return jnp.concatenate([ctrl, power, propellant]), jnp.concatenate(leaves)
+        scene.robots, scene.model.nu, ground.surface, now[0], qpos, qvel,
+        before, _shaped(orders, told))
+    out = [ctrl, power, propellant]
+    if ground.bed is not None:
+        forces, size, soil, of_treads = _soil(ground.bed, ground.surface, soil,
+                                              felt.reshape((-1, WIDTH)))
+        out += [of_treads.reshape(-1), forces.reshape(-1), size]
+    leaves = [leaf.reshape(-1).astype(jnp.float32) for leaf in jax.tree.leaves((controls, soil))]
+    return jnp.concatenate(out), jnp.concatenate(leaves)
 
 
 class NativeBackend:
@@ -271,11 +312,12 @@ class NativeBackend:
         self._substeps = _substeps(scene)
         self._batch: Batch | None = None
         self._cpu = jax.local_devices(backend="cpu")[0]
-        self._surface = jax.device_put(scene.surface, self._cpu)
+        self._ground = jax.device_put(Ground(scene.surface, scene.bed), self._cpu)
         start = partial(_start_controls, scene.robots)
         model = scene.model
         self._memory = jax.eval_shape(
-            lambda *a: _strong(start(*a)), jnp.zeros(model.nq), jnp.zeros(model.nv))
+            lambda *a: (_strong(start(*a)), jnp.zeros((len(scene.treads.geoms), 4))),
+            jnp.zeros(model.nq), jnp.zeros(model.nv))
         self._told = jax.tree.map(lambda a: a[0], hold(scene, 1))
         self._reset = jax.jit(jax.vmap(start))
         # Called every control step: few, flat arrays, and jit's own fast dispatch.
@@ -299,39 +341,44 @@ class NativeBackend:
         """
         _check_steps(num_control_steps, self.log_every)
         batch, nu = state.qpos.shape[0], self.scene.model.nu
-        worlds = _Worlds(self._pool(batch), state)
-        told, memory = _flat(commands, batch), self._remember(state.control, batch)
+        worlds = _Worlds(self._pool(batch), state, self.scene.treads)
+        told, memory = _flat(commands, batch), self._remember(state, batch)
         samples = num_control_steps // self.log_every
+        num_treads = len(self.scene.treads.geoms)
+        logged = 2 * len(self.scene.robots) + 3 * num_treads
         qpos = np.empty((batch, samples, self.scene.model.nq), np.float32)
-        costs = np.zeros((batch, samples, 2 * len(self.scene.robots)), np.float32)
+        costs = np.zeros((batch, samples, logged), np.float32)
         for step in range(num_control_steps):
-            out, memory = self._controllers(self._surface, worlds.seen(), memory, told)
+            out, memory = self._controllers(self._ground, worlds.seen(), memory, told)
             rows = np.asarray(out)
             begun = time.perf_counter()
-            worlds.step(rows[:, :nu], self._substeps)
+            worlds.step(rows[:, :nu], rows[:, nu + logged:], self._substeps)
             self.physics_s += time.perf_counter() - begun
             sample = step // self.log_every
-            costs[:, sample] += np.where(worlds.diverged[:, None], 0.0, rows[:, nu:])
+            costs[:, sample] += np.where(worlds.diverged[:, None], 0.0, rows[:, nu:nu + logged])
             if (step + 1) % self.log_every == 0:
                 qpos[:, sample] = worlds.qpos
-        power, propellant = np.split(costs / self.log_every, 2, axis=2)
-        log: Any = (qpos, power, propellant)
-        return worlds.state(_shaped(self._memory, np.asarray(memory))), Log(*log)
+        power, propellant, treads = np.split(
+            costs / self.log_every, np.cumsum([len(self.scene.robots)] * 2), axis=2)
+        log: Any = (qpos, power, propellant, treads.reshape(batch, samples, num_treads, 3))
+        return worlds.state(*_shaped(self._memory, np.asarray(memory))), Log(*log)
 
     def compile(self, batch: int, num_control_steps: int) -> float:
         """Compiles the controllers for B worlds; returns the seconds it took."""
         _check_steps(num_control_steps, self.log_every)
         state = self.reset(batch=batch)
-        worlds = _Worlds(self._pool(batch), state)
+        worlds = _Worlds(self._pool(batch), state, self.scene.treads)
         begun = time.perf_counter()
         jax.block_until_ready(self._controllers(
-            self._surface, worlds.seen(), self._remember(state.control, batch),
+            self._ground, worlds.seen(), self._remember(state, batch),
             _flat(hold(self.scene, batch), batch)))
         return time.perf_counter() - begun
 
-    def _remember(self, controls: Controls, batch: int) -> Array:
-        """The controllers' memory [B, n] where their next one will be, lest jit compile twice."""
-        return jax.device_put(_flat(controls, batch), self._cpu)
+    def _remember(self, state: WorldState, batch: int) -> Array:
+        """The memory of controllers and soil [B, n] where the next one will be, lest jit compile
+        twice.
+        """
+        return jax.device_put(_flat((state.control, state.soil), batch), self._cpu)
 
     def _pool(self, batch: int) -> Batch:
         if self._batch is None or self._batch.nsim != batch:
@@ -376,8 +423,8 @@ def _shaped(like: Any, rows: Any) -> Any:
 class _Worlds:
     """The rows of a batch while they are advanced, with the guard against divergence."""
 
-    def __init__(self, batch: Batch, state: WorldState):
-        self._batch = batch
+    def __init__(self, batch: Batch, state: WorldState, treads: Treads):
+        self._batch, self._treads = batch, treads
         self._time, self.qpos = batch.bind("time"), batch.bind("qpos")
         self._qvel, self._act = batch.bind("qvel"), batch.bind("act")
         self._warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
@@ -385,30 +432,48 @@ class _Worlds:
         self.qpos[:], self._qvel[:] = np.asarray(state.qpos), np.asarray(state.qvel)
         self._act[:], self._warmstart[:] = np.asarray(state.act), np.asarray(state.warmstart)
         self.diverged = np.array(state.diverged)
-        width = 1 + self.qpos.shape[1] + self._qvel.shape[1]
+        self._felt = np.array(state.felt, np.float32)
+        width = 1 + self.qpos.shape[1] + self._qvel.shape[1] + self._felt[0].size
         self._seen = np.empty((len(self.qpos), width), np.float32)
+        if len(treads.geoms):
+            self._forces, self._sizes = batch.bind("xfrc_applied"), batch.expand("geom_size")
+            for name in FELT_FIELDS:
+                batch.bind(name)
+            # A body may have several treads.
+            self._of = (treads.bodies[:, None] == np.arange(self._forces.shape[1])).astype(float)
 
     def seen(self) -> np.ndarray:
-        """Time, qpos and qvel side by side [B, 1 + nq + nv] in the controllers' precision.
+        """Time, qpos, qvel and what treads feel side by side [B, 1 + nq + nv + C WIDTH] in the
+        controllers' precision.
 
         The same memory at every call.
         """
-        nq = self.qpos.shape[1]
+        nq, nv = self.qpos.shape[1], self._qvel.shape[1]
         self._seen[:, 0] = self._time
         self._seen[:, 1:1 + nq] = self.qpos
-        self._seen[:, 1 + nq:] = self._qvel
+        self._seen[:, 1 + nq:1 + nq + nv] = self._qvel
+        self._seen[:, 1 + nq + nv:] = self._felt.reshape(len(self._felt), -1)
         return self._seen
 
-    def step(self, ctrl: np.ndarray, substeps: int) -> None:
+    def step(self, ctrl: np.ndarray, soil: np.ndarray, substeps: int) -> None:
         """One control step of the worlds that still run; one that blows up goes back to
         where it was before the step and stays there.
+
+        `soil`: forces on the treads' bodies and the treads' radii, side by side [B, 7 C].
         """
         before = self.qpos.copy()
         self._ctrl[:] = ctrl
+        count = len(self._treads.geoms)
+        if count:
+            forces = soil[:, :6 * count].reshape(-1, count, 6)
+            self._forces[:] = np.einsum("bcf,cn->bnf", forces, self._of)
+            self._sizes[:, self._treads.geoms, 0] = soil[:, 6 * count:]
         if not self.diverged.any():
             self._batch.step(nstep=substeps)
         elif not self.diverged.all():
             self._batch.step(ids=np.flatnonzero(~self.diverged), nstep=substeps)
+        if count:
+            self._felt[~self.diverged] = self._treads.felt(self._batch, np)[~self.diverged]
         # Not a number makes this comparison false, too.
         bad = ~(np.abs(self._qvel).max(axis=1) <= MAX_SPEED)
         bad |= ~np.isfinite(self.qpos).all(axis=1)
@@ -417,14 +482,15 @@ class _Worlds:
             self.qpos[bad] = before[bad]
             self._qvel[bad] = self._warmstart[bad] = 0.0
 
-    def state(self, controls: Controls) -> WorldState:
+    def state(self, controls: Controls, soil: Array) -> WorldState:
         """The worlds as they now are."""
         def single(rows: np.ndarray) -> Any:
             return rows.astype(np.float32)
 
         gone: Any = self.diverged
         return WorldState(single(self._time), single(self.qpos), single(self._qvel),
-                          single(self._act), single(self._warmstart), gone, controls)
+                          single(self._act), single(self._warmstart), gone, controls, soil,
+                          single(self._felt))
 
 
 def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> WorldState:
@@ -433,4 +499,6 @@ def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> W
     held = jnp.asarray(places, jnp.float32)
     still = jnp.zeros((size, model.nv))
     return WorldState(jnp.zeros(size), held, still, jnp.zeros((size, model.na)), still,
-                      jnp.zeros(size, bool), _strong(start(held, still)))
+                      jnp.zeros(size, bool), _strong(start(held, still)),
+                      jnp.zeros((size, len(scene.treads.geoms), 4)),
+                      jnp.zeros((size, len(scene.treads.geoms), WIDTH)))

@@ -17,6 +17,9 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.physics import mjx
+from moonteam.physics.regolith import treads
+from moonteam.physics.regolith.bed import Bed
+from moonteam.physics.regolith.treads import Treads
 from moonteam.robots.base import GRAVITY, PHYSICS_DT, RobotKind
 from moonteam.terrain.site import Boulder, Site
 from moonteam.terrain.surface import Surface
@@ -25,6 +28,10 @@ FRICTION = 0.75
 """Sliding friction of regolith: the tangent of its angle of repose, about 37 degrees."""
 
 GEOM = mujoco.mjtGeom
+
+NO_TREADS = Treads(*np.zeros((5, 0), np.intp))
+"""Of rigid ground."""
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -58,6 +65,8 @@ class Scene:
     site: Site
     qpos0: np.ndarray  # [nq] every robot standing at its start
     spec: mujoco.MjSpec  # what the model was compiled from
+    bed: Bed | None = None  # ground that gives way, and
+    treads: Treads = NO_TREADS  # which wheels and feet feel it
 
 
 def build_scene(
@@ -92,9 +101,10 @@ def build_scene(
     for index, boulder in enumerate(site.boulders):
         _add_boulder(spec, index, boulder, friction)
     for placement in placements:
-        robot = placement.kind.load()
-        spec.worldbody.add_frame().attach_body(
-            robot.body(placement.kind.base), placement.name + "/", "")
+        robot, prefix = placement.kind.load(), placement.name + "/"
+        felt = treads.mark(robot) if site.soil else []
+        spec.worldbody.add_frame().attach_body(robot.body(placement.kind.base), prefix, "")
+        treads.add_sensors(spec, prefix, felt)
     model = spec.compile()
     set_heights(model, site.heights)
     check_collisions(model)
@@ -103,7 +113,12 @@ def build_scene(
     for robot, placement in zip(robots, placements, strict=True):
         qpos0[robot.qpos] = start_pose(site, placement)
     # model.qpos0 stays: it is where joint angles are measured from, not only a start.
-    return Scene(model, robots, site.surface, site, qpos0, spec)
+    if site.soil is None:
+        return Scene(model, robots, site.surface, site, qpos0, spec)
+    named = [(placement.name + "/", placement.kind) for placement in placements]
+    found = treads.find(model, named)
+    bed = treads.bed_for(site.soil, model, found, named)
+    return Scene(model, robots, site.surface, site, qpos0, spec, bed, found)
 
 
 def start_pose(site: Site, placement: Placement) -> np.ndarray:
@@ -204,8 +219,9 @@ def _add_ground(spec: mujoco.MjSpec, site: Site, friction: float) -> None:
                     userdata=np.zeros(rows * columns))
     spec.worldbody.add_geom(
         name="ground", type=GEOM.mjGEOM_HFIELD, hfieldname="ground", pos=[0, 0, low],
-        contype=1, conaffinity=0, condim=3, priority=1, friction=[friction, 0.005, 0.0001],
-        rgba=[0.5, 0.5, 0.5, 1])
+        # Where soil gives way the contact carries the weight, and the soil does the rest.
+        contype=1, conaffinity=0, condim=1 if site.soil else 3, priority=1,
+        friction=[friction, 0.005, 0.0001], rgba=[0.5, 0.5, 0.5, 1])
 
 
 def vertical_range(heights: np.ndarray) -> float:

@@ -31,6 +31,10 @@ Place = tuple[int | float, int | float]
 """(x, y) in cells, [0, 0] the centre of the cell in the lower left; a cell where both are whole."""
 
 
+SoilName = Literal["nominal", "loose", "dense", "lunar", "grc1"]
+"""The soils of `moonteam.terrain.soil`."""
+
+
 class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The mission grid: `size` in cells (W, H), `cell_m` metres a side of a cell."""
 
@@ -41,14 +45,17 @@ class Map(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The ground: a `preset` made from `seed`, or a `dem` file (GeoTIFF or .npy).
 
-    The other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel` and a unit of
-    elevation (`scale`) where the file does not say; `detrend` takes the plane of best fit out;
-    `detail` adds relief finer than its pixels, from `seed`.
+    `ground` is rigid, or regolith, in which wheels and feet sink and slip, of a `soil` that
+    `seed` scatters. The other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel`
+    and a unit of elevation (`scale`) where the file does not say; `detrend` takes the plane of
+    best fit out; `detail` adds relief finer than its pixels, from `seed`.
     """
 
     preset: str | None = None
     dem: str | None = None
     seed: int = 0
+    ground: Literal["rigid", "regolith"] = "rigid"
+    soil: SoilName = "nominal"
     centre: tuple[float, float] | None = None
     size: float | tuple[float, float] | None = None
     units: Units = "metres"
@@ -65,7 +72,8 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
         return Piece(self.size, self.centre, self.units, self.rotation)
 
 
-MODEL_ONLY = tuple(key for key in Site.__struct_fields__ if key not in ("preset", "dem", "seed"))
+MODEL_ONLY = tuple(key for key in Site.__struct_fields__
+                   if key not in ("preset", "dem", "seed", "ground", "soil"))
 """Keys of a site that mean nothing without a dem."""
 
 
@@ -325,6 +333,8 @@ def _check_site(site: Site, source: object) -> None:
             if getattr(site, key) != getattr(Site(), key):
                 raise InputError(source, "is for an elevation model; give dem in place of preset",
                                  f"site.{key}")
+    if site.ground == "rigid" and site.soil != Site().soil:
+        raise InputError(source, "a soil is of ground: regolith, which is not given", "site.soil")
     site.piece.check(lambda key, problem: InputError(source, problem, f"site.{key}"))
     if site.band < 0:
         raise InputError(source, f"{site.band} is not allowed; at least 0", "site.band")

@@ -56,6 +56,16 @@ class Telemetry(NamedTuple):
     propellant: Array  # [] kg/s used; 0 where there is none
 
 
+class Tread(NamedTuple):
+    """What touches the ground, for soil that gives way: each sphere that meets it is a wheel, or a
+    foot with a flat round sole.
+    """
+
+    width: float = 0.06  # m, of a wheel; diameter of a sole
+    grousers: float = 0.0  # m high, of a wheel within the sphere's radius; 0: smooth
+    rolls: bool = False  # whether it is a wheel, about the hinge of its body
+
+
 class Camera(NamedTuple):
     """How a film of one robot is taken."""
 
@@ -64,6 +74,7 @@ class Camera(NamedTuple):
 
 
 CAMERA = Camera()
+SOLE = Tread()
 
 
 class Tuning(NamedTuple):
@@ -106,6 +117,7 @@ class RobotKind:
     lands_for: float = math.inf  # s of service from which what flies comes down for it
     fall_tilt: float = math.radians(60.0)  # rad of the base from the vertical: fallen
     odometry: Callable[[Floats, Height | None], tuple[float, float] | None] | None = None
+    tread: Tread = SOLE
     contacts: int = 8  # with ground and boulders that count at once: two a foot or wheel
     callsign: str = ""  # of the one in a random team; "": its kind's name
     glyph: Glyph = "disc"  # how a map marks it

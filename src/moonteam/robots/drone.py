@@ -21,6 +21,7 @@ from moonteam.robots.base import (
     Command,
     RobotKind,
     Telemetry,
+    Tread,
     quat_matrix,
     times,
 )
@@ -181,5 +182,6 @@ def _yaw(rotation: Array) -> Array:
 DRONE = RobotKind(
     name="drone", load=load, base="drone", spawn_height=STANDING_HEIGHT, home=np.zeros(0),
     speed=CRUISE_SPEED, footprint=0.3, max_slope=float(np.deg2rad(30.0)), init=init,
-    control=control, settle=1.9, flies=True, lands_for=20.0, callsign="hopper", glyph="triangle",
+    control=control, settle=1.9, flies=True, lands_for=20.0, tread=Tread(width=0.09),
+    callsign="hopper", glyph="triangle",
     camera=Camera(distance=4.2, seconds=16.0))  # from take-off to the goal

@@ -30,6 +30,7 @@ from moonteam.robots.base import (
     Command,
     RobotKind,
     Telemetry,
+    Tread,
     Tuning,
     quat_matrix,
     times,
@@ -393,6 +394,7 @@ LEGGED = RobotKind(
     max_step=0.16,  # half a leg's reach
     settle=0.8,
     slowing=0.3,  # from `moonteam evaluate slopes`
+    tread=Tread(width=0.07, grousers=0.006),
     odometry=odometry,
     callsign="strider",
     glyph="disc",

@@ -24,6 +24,7 @@ from moonteam.robots.base import (
     Height,
     RobotKind,
     Telemetry,
+    Tread,
     quat_matrix,
     wheel_odometry,
 )
@@ -207,5 +208,6 @@ WHEELED = RobotKind(
     control=control,
     max_step=0.12,  # under a wheel's radius
     settle=0.6, slowing=0.05,  # from `moonteam evaluate slopes`
+    tread=Tread(width=0.10, grousers=0.010, rolls=True),
     odometry=odometry, callsign="rover", glyph="square", colour="#c9bfb1",
     camera=Camera(distance=2.9, seconds=10.0))

@@ -23,6 +23,8 @@ from moonteam.errors import InputError, meant
 from moonteam.problem.mission import Mission
 from moonteam.problem.piece import WHOLE, Piece
 from moonteam.terrain import dem, generate
+from moonteam.terrain import soil as soils
+from moonteam.terrain.soil import Soil
 from moonteam.terrain.surface import Surface
 
 SPACING = 0.25
@@ -71,6 +73,7 @@ class Site:
     spacing: float  # m
     boulders: tuple[Boulder, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict)
+    soil: Soil | None = None  # what the ground is made of; None: it is rigid
 
     @functools.cached_property
     def surface(self) -> Surface:
@@ -80,7 +83,8 @@ class Site:
         """
         with jax.ensure_compile_time_eval():
             ground = jnp.asarray(self.heights, jnp.float32)
-            return Surface(ground, self.spacing, jnp.asarray(self._tops(), jnp.float32))
+            return Surface(ground, self.spacing, jnp.asarray(self._tops(), jnp.float32),
+                           self.soil is not None)
 
     def _tops(self) -> np.ndarray:
         """Elevations [ny, nx] m, raised to a boulder's top as far as OVERHANG around it."""
@@ -142,21 +146,39 @@ def for_mission(mission: Mission, spacing: float = SPACING, source: object = Non
     An elevation model has to cover the map alone. Raises InputError naming `source`, where one is
     given, and the key.
     """
-    width, height = (n * mission.map.cell_m for n in mission.map.size)
-    its = mission.site
     try:
-        if its.dem is None:
-            return make_site(its.preset or "mare", its.seed,
-                             (width + 2 * MARGIN, height + 2 * MARGIN), spacing)
-        return import_dem(
-            its.dem, its.piece, need=(width, height), margin=MARGIN, pixel=its.pixel,
-            band=its.band, scale=its.scale, detrend=its.detrend, detail=its.detail,
-            spacing=spacing, seed=its.seed)
+        site = _mission_ground(mission, spacing)
     except InputError as error:
         if source is None:
             raise
+        its = mission.site
         raise InputError(source, f"{error.source}: {error.problem}" if its.dem else error.problem,
                          _mission_key(mission, error.key)) from None
+    if mission.site.ground == "rigid":
+        return site
+    return with_soil(site, mission.site.soil)
+
+
+def with_soil(site: Site, soil: str) -> Site:
+    """The site with ground that gives way, of a soil as its seed draws it; `meta` tells which.
+
+    Raises InputError for an unknown soil.
+    """
+    found = soils.drawn(soils.find(soil, f"site {site.name}", "soil"), site.seed)
+    told = {key: getattr(found, key) for key in ("k_phi", "cohesion", "friction", "shear")}
+    return replace(site, soil=found, meta=site.meta | {"soil": {"name": found.name} | told})
+
+
+def _mission_ground(mission: Mission, spacing: float) -> Site:
+    width, height = (n * mission.map.cell_m for n in mission.map.size)
+    its = mission.site
+    if its.dem is None:
+        return make_site(its.preset or "mare", its.seed,
+                         (width + 2 * MARGIN, height + 2 * MARGIN), spacing)
+    return import_dem(
+        its.dem, its.piece, need=(width, height), margin=MARGIN, pixel=its.pixel,
+        band=its.band, scale=its.scale, detrend=its.detrend, detail=its.detail,
+        spacing=spacing, seed=its.seed)
 
 
 def _mission_key(mission: Mission, key: str) -> str:

@@ -24,6 +24,7 @@ class Surface:
     heights: Array  # [ny, nx] m, float32
     spacing: float = field(metadata={"static": True})  # m
     tops: Array | None = None  # [ny, nx] m, ground or the boulder above it; None: no boulders
+    soft: bool = field(default=False, metadata={"static": True})  # whether wheels and feet sink in
 
     @property
     def extent(self) -> tuple[float, float]:

@@ -1,0 +1,1 @@
+"""Ground that gives way: the forces of loose soil on wheels and feet."""
