@@ -51,6 +51,8 @@ COMMANDS = {
         "moonteam.commands.evaluate_traverse", "each kind of robot on its own over a site"),
     "evaluate slopes": (
         "moonteam.commands.evaluate_slopes", "how steep each kind of robot can go"),
+    "evaluate soil": (
+        "moonteam.commands.evaluate_soil", "the regolith model beside published experiments"),
     "check robot": (
         "moonteam.commands.check_robot", "whether a kind of robot keeps what all must keep"),
     "check planner": (

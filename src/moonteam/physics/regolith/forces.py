@@ -7,8 +7,8 @@ ground's plane that grows with the slip velocity and is left behind as a wheel r
     du/dt = v_slip - u v / L,        slip s = u / L,
 
 so that rolling steadily s is the slip ratio (v_roll - v) / v_roll, and standing still the soil
-holds like a spring until it shears. Grip, resistance, torque and sinkage are looked up over load and
-slip (`bed`). Forces are made anew every CONTROL_PERIOD and held in between.
+holds like a spring until it shears. Grip, resistance, torque and sinkage are looked up over load
+and slip (`bed`). Forces are made anew every CONTROL_PERIOD and held in between.
 
 Legend: C treads.
 """
@@ -33,7 +33,7 @@ NEAR = 0.02
 DAMPING = 0.1
 """s; moving soil resists more than still soil, by this times the rate at which it is moved."""
 
-CREEP = 0.02
+CREEP = 0.005
 """Speed, m/s, at which the resistance to rolling is three quarters there."""
 
 SETTLING = 0.3
