@@ -22,7 +22,8 @@ def by_the_clock(mission: Mission, source: object) -> Mission:
 
 def roads_of(prepared: Prepared) -> Roads:
     """The ways of a mission's ground, which are found as they are asked for."""
-    return Roads.of_mission(prepared.site, prepared.mission, team.limits(prepared.kinds))
+    limits = team.limits(prepared.kinds, prepared.site)
+    return Roads.of_mission(prepared.site, prepared.mission, limits)
 
 
 def execution_of(prepared: Prepared, chooser: Chooser, seed: int,

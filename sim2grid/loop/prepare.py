@@ -60,7 +60,7 @@ def prepare(mission: Mission, source: object) -> Prepared:
     mission, kinds = team.resolve(written, source)
     frame = Frame(mission.map.size, mission.map.cell_m)
     site = for_mission(mission, source=source)
-    passable = passable_cells(site, mission, team.limits(kinds))
+    passable = passable_cells(site, mission, team.limits(kinds, site))
     for i, robot in enumerate(mission.robots):
         x, y = robot.cell
         if not passable[robot.kind][y, x]:

@@ -342,7 +342,7 @@ class Group:
     @cached_property
     def _roads(self) -> Roads:
         fleet = self._fleet
-        return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds))
+        return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds, fleet.site))
 
     def _promises(self, contender: Contender, todo: Iterable[int]) -> dict[int, Promise]:
         """What a planner by the clock makes of each mission at its start, ways alone counted."""

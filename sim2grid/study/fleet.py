@@ -241,7 +241,7 @@ def ground_of(recipe: Recipe, change: Callable[[Ground], Ground] = lambda ground
     kinds = {kind.name: kind for kind in crew(recipe)}
     empty = Mission(Map((recipe.side, recipe.side), recipe.cell_m), (), (), recipe.site)
     site = change(for_mission(empty))
-    passable = passable_cells(site, empty, team.limits(kinds))
+    passable = passable_cells(site, empty, team.limits(kinds, site))
     for name, cells in passable.items():
         if not cells.any():
             raise InputError(recipe.source, f"no cell of it is open to a {name} robot (slopes, "

@@ -127,7 +127,7 @@ class Stage:
     def roads(self) -> Roads:
         """Ways in seconds."""
         fleet = self.fleet
-        return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds))
+        return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds, fleet.site))
 
     def run(self, deciders: Mapping[int, Who]) -> dict[int, Report]:
         """Missions of the block to their ends, side by side: index -> report.

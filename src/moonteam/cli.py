@@ -53,6 +53,8 @@ COMMANDS = {
         "moonteam.commands.evaluate_slopes", "how steep each kind of robot can go"),
     "evaluate soil": (
         "moonteam.commands.evaluate_soil", "the regolith model beside published experiments"),
+    "evaluate paces": (
+        "moonteam.commands.evaluate_paces", "how soil slows each kind of robot, by slope"),
     "check robot": (
         "moonteam.commands.check_robot", "whether a kind of robot keeps what all must keep"),
     "check planner": (

@@ -287,5 +287,6 @@ def test_a_map_as_large_as_its_model_is_open_to_its_edge(tmp_path):
     """8 m of ground for 8 m: no robot is kept off the outermost cells."""
     found = missions.load(mission_on(tmp_path, np.zeros((8, 8)), "detail: false"))
     kinds = {name: KINDS.get(name) for name in OWN}
-    for name, cells in passable_cells(for_mission(found), found, limits(kinds)).items():
+    site = for_mission(found)
+    for name, cells in passable_cells(site, found, limits(kinds, site)).items():
         assert cells.all(), name

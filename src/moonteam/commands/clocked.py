@@ -74,7 +74,7 @@ def ground_of(mission: Mission) -> Ground:
         named = msgspec.structs.replace(named, events=())
     named = msgspec.structs.replace(named, clock="seconds")
     site = for_mission(named, source=mission.name)
-    roads = Roads.of_mission(site, named, team.limits(kinds))
+    roads = Roads.of_mission(site, named, team.limits(kinds, site))
     its = [kinds[robot.kind] for robot in named.robots]
     asked = OnGround(named, [kind.speed for kind in its], [kind.settle for kind in its])
     return Ground(asked, site, roads)

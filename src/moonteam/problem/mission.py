@@ -46,7 +46,8 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     """The ground: a `preset` made from `seed`, or a `dem` file (GeoTIFF or .npy).
 
     `ground` is rigid, or regolith, in which wheels and feet sink and slip, of a `soil` that
-    `seed` scatters. The other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel`
+    `seed` scatters; `fields` of it are as robots were measured on that soil, or as on rigid
+    ground. The other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel`
     and a unit of elevation (`scale`) where the file does not say; `detrend` takes the plane of
     best fit out; `detail` adds relief finer than its pixels, from `seed`.
     """
@@ -56,6 +57,7 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     seed: int = 0
     ground: Literal["rigid", "regolith"] = "rigid"
     soil: SoilName = "nominal"
+    fields: Literal["measured", "rigid"] = "measured"
     centre: tuple[float, float] | None = None
     size: float | tuple[float, float] | None = None
     units: Units = "metres"
@@ -73,7 +75,7 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 MODEL_ONLY = tuple(key for key in Site.__struct_fields__
-                   if key not in ("preset", "dem", "seed", "ground", "soil"))
+                   if key not in ("preset", "dem", "seed", "ground", "soil", "fields"))
 """Keys of a site that mean nothing without a dem."""
 
 
@@ -333,8 +335,9 @@ def _check_site(site: Site, source: object) -> None:
             if getattr(site, key) != getattr(Site(), key):
                 raise InputError(source, "is for an elevation model; give dem in place of preset",
                                  f"site.{key}")
-    if site.ground == "rigid" and site.soil != Site().soil:
-        raise InputError(source, "a soil is of ground: regolith, which is not given", "site.soil")
+    for key in ("soil", "fields"):
+        if site.ground == "rigid" and getattr(site, key) != getattr(Site(), key):
+            raise InputError(source, "is of ground: regolith, which is not given", f"site.{key}")
     site.piece.check(lambda key, problem: InputError(source, problem, f"site.{key}"))
     if site.band < 0:
         raise InputError(source, f"{site.band} is not allowed; at least 0", "site.band")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
@@ -23,6 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from jax import Array
 
+from moonteam import files
+from moonteam.paths import assets
 from moonteam.terrain.surface import Surface
 from moonteam.terrain.traversability import Limits
 
@@ -64,6 +66,14 @@ class Tread(NamedTuple):
     width: float = 0.06  # m, of a wheel; diameter of a sole
     grousers: float = 0.0  # m high, of a wheel within the sphere's radius; 0: smooth
     rolls: bool = False  # whether it is a wheel, about the hinge of its body
+
+
+class Pace(NamedTuple):
+    """How fast a kind is on a soil, as maps and travel fields believe it."""
+
+    speed: float  # m/s on the level
+    max_slope: float  # rad, beyond which it must not go
+    slowing: float  # share of its speed lost there, in proportion to the slope
 
 
 class Camera(NamedTuple):
@@ -118,6 +128,7 @@ class RobotKind:
     fall_tilt: float = math.radians(60.0)  # rad of the base from the vertical: fallen
     odometry: Callable[[Floats, Height | None], tuple[float, float] | None] | None = None
     tread: Tread = SOLE
+    paces: Mapping[str, Pace] = field(default_factory=dict)  # by soil; without: as on rigid ground
     contacts: int = 8  # with ground and boulders that count at once: two a foot or wheel
     callsign: str = ""  # of the one in a random team; "": its kind's name
     glyph: Glyph = "disc"  # how a map marks it
@@ -127,9 +138,21 @@ class RobotKind:
 
     @property
     def limits(self) -> Limits:
-        """What ground it can cross, as maps ask for it."""
-        return Limits(self.footprint, self.max_slope, self.max_step, self.speed, self.slowing,
+        """What rigid ground it can cross, as maps ask for it."""
+        return self.limits_on(None)
+
+    def limits_on(self, soil: str | None) -> Limits:
+        """What ground of a soil it can cross, as maps ask for it; None: rigid ground."""
+        pace = self.paces.get(soil or "", Pace(self.speed, self.max_slope, self.slowing))
+        return Limits(self.footprint, pace.max_slope, self.max_step, pace.speed, pace.slowing,
                       self.flies)
+
+
+def paces_of(name: str) -> dict[str, Pace]:
+    """The bundled paces of a kind by soil, as `moonteam evaluate paces` has measured them."""
+    soils = files.read_json(assets() / "robots" / "paces.json")["soils"]
+    return {soil: Pace(**by_kind[name]["pace"]) for soil, by_kind in soils.items()
+            if name in by_kind}
 
 
 def times(matrix: Array, vector: Array) -> Array:

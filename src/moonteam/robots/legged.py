@@ -32,6 +32,7 @@ from moonteam.robots.base import (
     Telemetry,
     Tread,
     Tuning,
+    paces_of,
     quat_matrix,
     times,
     turned,
@@ -395,6 +396,7 @@ LEGGED = RobotKind(
     settle=0.8,
     slowing=0.3,  # from `moonteam evaluate slopes`
     tread=Tread(width=0.07, grousers=0.006),
+    paces=paces_of("legged"),
     odometry=odometry,
     callsign="strider",
     glyph="disc",

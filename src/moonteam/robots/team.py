@@ -16,6 +16,7 @@ from moonteam.errors import InputError
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import Mission
 from moonteam.robots import KINDS, RobotKind
+from moonteam.terrain.site import Site
 from moonteam.terrain.traversability import Limits
 
 Kinds = dict[str, RobotKind]  # by their names
@@ -75,9 +76,10 @@ def with_kinds(mission: Mission, name: Callable[[str, str], str]) -> Mission:
     return msgspec.structs.replace(mission, robots=robots, events=events)
 
 
-def limits(kinds: Mapping[str, RobotKind]) -> dict[str, Limits]:
-    """What ground each kind can cross."""
-    return {name: kind.limits for name, kind in kinds.items()}
+def limits(kinds: Mapping[str, RobotKind], site: Site) -> dict[str, Limits]:
+    """What ground of a site each kind can cross, as it is known there."""
+    soil = site.soil.name if site.soil and site.known else None
+    return {name: kind.limits_on(soil) for name, kind in kinds.items()}
 
 
 def beside(written: str, source: object) -> str:

@@ -25,6 +25,7 @@ from moonteam.robots.base import (
     RobotKind,
     Telemetry,
     Tread,
+    paces_of,
     quat_matrix,
     wheel_odometry,
 )
@@ -53,6 +54,9 @@ POSITION_GAIN = 1.0  # 1/s
 STOP, RESTART = 0.04, 0.10  # m from the waypoint: stops within, moves again beyond
 REVERSE_WITHIN = 1.6  # m; a shorter way back is driven backwards
 SLIP = 0.15  # m/s between rim and ground, plus half the ground speed
+SPINNING = 0.7  # slip of wheels that get nowhere in soft ground
+DIGGING = 0.08  # m/s of the rim from which on that counts
+PATIENCE, BACK_OUT, BACK_SPEED = 1.5, 2.5, 0.25  # s of it, s back, m/s
 MAX_SLOPE = float(np.deg2rad(18.0))  # of the ground it is sent over
 REFUSED = np.deg2rad(19.7)  # of the ground ahead: there it stands still
 CAUTION = np.deg2rad(1.0)  # before that it slows down
@@ -69,6 +73,8 @@ class WheeledState(NamedTuple):
     arrived: Array  # [] bool
     reverse: Array  # [] bool, driving backwards
     integral: Array  # [4] rad, wheel angle lacking
+    dug: Array  # [] s that its wheels have been spinning in soft ground
+    backing: Array  # [] s that it still backs out for
 
 
 def load() -> mujoco.MjSpec:
@@ -113,7 +119,8 @@ def init(qpos: Array, qvel: Array) -> WheeledState:
     """Standing at qpos [7 + 6], holding that place."""
     del qvel
     still = jnp.array(False)
-    return WheeledState(start_path(qpos[:2]), still, still, jnp.zeros(4))
+    never = jnp.zeros(())
+    return WheeledState(start_path(qpos[:2]), still, still, jnp.zeros(4), never, never)
 
 
 def control(
@@ -125,8 +132,10 @@ def control(
     rotation = quat_matrix(qpos[3:7] / (jnp.linalg.norm(qpos[3:7]) + 1e-9))
     path = update_path(state.path, qpos[:2], command)
     state, speed, turn = _steer(state._replace(path=path), qpos, rotation, command)
-    speed = speed * _passable(speed, qpos, rotation, surface)
     wheel = qvel[6 + WHEELS]
+    if surface.soft:
+        state, speed, turn = _unstuck(state, speed, turn, wheel, rotation, qvel)
+    speed = speed * _passable(speed, qpos, rotation, surface)
     wanted = _wheel_speeds(speed, turn, rotation, qvel)
     error = wanted - wheel
     torque = SPEED_GAIN * error + INTEGRAL_GAIN * state.integral
@@ -166,6 +175,23 @@ def _steer(
     moving = jnp.where(arrived, 0.0, 1.0)
     state = state._replace(arrived=arrived, reverse=reverse)
     return state, speed * moving, turn * moving
+
+
+def _unstuck(state: WheeledState, speed: Array, turn: Array, wheel: Array, rotation: Array,
+             qvel: Array) -> tuple[WheeledState, Array, Array]:
+    """Wheels that spin dig themselves in: it notices, and backs out the way that it came."""
+    rolling, ground = jnp.mean(wheel) * WHEEL_RADIUS, jnp.sum(rotation[:, 0] * qvel[:3])
+    way = jnp.sign(rolling)
+    spinning = (jnp.abs(rolling) > DIGGING) & (ground * way < (1.0 - SPINNING) * jnp.abs(rolling))
+    spinning = spinning & (state.backing <= 0.0)
+    dug = jnp.where(spinning, state.dug + CONTROL_PERIOD,
+                    jnp.maximum(state.dug - CONTROL_PERIOD, 0.0))
+    stuck = dug > PATIENCE
+    backing = jnp.where(stuck, BACK_OUT, jnp.maximum(state.backing - CONTROL_PERIOD, 0.0))
+    reverse = jnp.where(stuck, way < 0.0, state.reverse)
+    back = jnp.where(reverse, 1.0, -1.0) * BACK_SPEED
+    state = state._replace(dug=jnp.where(stuck, 0.0, dug), backing=backing, reverse=reverse)
+    return (state, jnp.where(backing > 0.0, back, speed), jnp.where(backing > 0.0, 0.0, turn))
 
 
 def _passable(speed: Array, qpos: Array, rotation: Array, surface: Surface) -> Array:
@@ -208,6 +234,6 @@ WHEELED = RobotKind(
     control=control,
     max_step=0.12,  # under a wheel's radius
     settle=0.6, slowing=0.05,  # from `moonteam evaluate slopes`
-    tread=Tread(width=0.10, grousers=0.010, rolls=True),
+    tread=Tread(width=0.10, grousers=0.010, rolls=True), paces=paces_of("wheeled"),
     odometry=odometry, callsign="rover", glyph="square", colour="#c9bfb1",
     camera=Camera(distance=2.9, seconds=10.0))

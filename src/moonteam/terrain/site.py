@@ -74,6 +74,7 @@ class Site:
     boulders: tuple[Boulder, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict)
     soil: Soil | None = None  # what the ground is made of; None: it is rigid
+    known: bool = True  # whether maps and fields know the soil, or believe that it is rigid
 
     @functools.cached_property
     def surface(self) -> Surface:
@@ -156,7 +157,7 @@ def for_mission(mission: Mission, spacing: float = SPACING, source: object = Non
                          _mission_key(mission, error.key)) from None
     if mission.site.ground == "rigid":
         return site
-    return with_soil(site, mission.site.soil)
+    return replace(with_soil(site, mission.site.soil), known=mission.site.fields == "measured")
 
 
 def with_soil(site: Site, soil: str) -> Site:
