@@ -13,6 +13,7 @@ from moonteam import files
 from moonteam.cluster import Cluster, cluster
 from moonteam.commands.options import Apart, Elevation, Missions, Planning, Reported, Resumable
 from moonteam.errors import InputError
+from moonteam.problem.mission import SoilName
 from moonteam.report import command, journal
 from moonteam.report.command import Aside
 from moonteam.report.journal import Journal
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
     from sim2grid.study.fleet import Given, Recipe
 
 DRAWN = ("team", "site", "count", "cell", "lose", "slow", "silent", "new_targets", "impassable",
-         "site_seed", "targets", "side", "max_steps", *(field.name for field in fields(Elevation)))
+         "site_seed", "targets", "side", "max_steps", "ground", "soil", "fields",
+         *(field.name for field in fields(Elevation)))
 """Options of random missions, which a mission that is given answers itself."""
 
 FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")
@@ -67,6 +69,13 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     that are left out are drawn."""
     site: tuple[Literal["mare", "highland", "crater_rim", "polar", "flat"], ...] = ("mare",)
     """Presets of the ground, one group of missions each; without --dem."""
+    ground: Literal["rigid", "regolith"] = "rigid"
+    """Whether the ground carries everything, or wheels and feet sink in and slip."""
+    soil: SoilName = "nominal"
+    """Of regolith."""
+    fields: Literal["measured", "rigid"] = "measured"
+    """What plans believe of regolith: how each kind was measured on that soil, or as on rigid
+    ground. The missions are the same."""
     count: int = 20
     """Missions a site."""
     loop: tuple[Literal["closed", "open", "oracle", "grid"], ...] = ("closed",)
@@ -194,11 +203,18 @@ def _recipes(args: Args) -> list[Recipe]:
         raise InputError("--site", "give presets or an elevation model, not both; it has --dem")
     team, skills = parse_team(args.team) if args.team else (TEAM, ())
     rates = Rates(args.lose, args.slow, args.silent, args.new_targets, args.impassable)
-    grounds: list[tuple[str, Site | None]] = [(site, None) for site in args.site]
+    if args.ground == "rigid":
+        for name in ("soil", "fields"):
+            if getattr(args, name) != getattr(Args(), name):
+                raise InputError(command.flag(name), "is of --ground regolith, which is not given")
+    its: dict[str, Any] = {"seed": args.site_seed, "ground": args.ground, "soil": args.soil,
+                           "fields": args.fields}
+    grounds = [(site, Site(preset=site, **its)) for site in args.site]
     if args.dem is not None:
         grounds = [(args.dem.stem, Site(
-            None, os.fspath(args.dem.resolve()), args.site_seed, args.centre, None, args.units,
-            args.rotation, args.pixel, args.band, args.scale, args.detrend, args.detail))]
+            dem=os.fspath(args.dem.resolve()), centre=args.centre, units=args.units,
+            rotation=args.rotation, pixel=args.pixel, band=args.band, scale=args.scale,
+            detrend=args.detrend, detail=args.detail, **its))]
     # The exact planner, whose plans say which missions can be, takes 6 robots.
     return [Recipe(name, args.site_seed, args.seed, args.targets, args.side, args.cell,
                    args.max_steps, rates, team, "exact" if len(team) <= 6 else "greedy", skills,

@@ -19,7 +19,7 @@ from moonteam.problem.scenario import Cell
 from moonteam.robots.base import Height, RobotKind
 from sim2grid.frame import Frame, tilt
 from sim2grid.loop.record import Leg, Record
-from sim2grid.measure.slip import slip
+from sim2grid.measure.slip import expected, slip
 
 Floats = npt.NDArray[np.float64]
 
@@ -107,6 +107,8 @@ class RobotReport(msgspec.Struct, frozen=True):
     driving_s: float | None = None  # by the clock: on its ways,
     slower_s: float | None = None  # of which so much more than the ground says,
     service_s: float | None = None  # and in services
+    expected_slip: float | None = None  # on regolith, by what its kind is known to do there
+    expected_energy_j: float | None = None
 
 
 class GridPlan(msgspec.Struct, frozen=True):
@@ -199,7 +201,19 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
         distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
         energy_j=_round(float((track.power[1:] * steps).sum())),
         propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6),
-        **time_spent(record, robot))
+        **time_spent(record, robot), **on_soil(mission, kind, track, height))
+
+
+def on_soil(mission: Mission, kind: RobotKind | None, track: Track, height: Height | None
+            ) -> dict[str, float | None]:
+    """What was to be expected of a robot's way on the mission's soil; nothing on rigid ground."""
+    pace = None if kind is None or mission.site.ground == "rigid" else (
+        kind.paces.get(mission.site.soil))
+    if pace is None or track.qpos is None or height is None:
+        return {}
+    its, energy = expected(pace, track.qpos, height)
+    return {"expected_slip": None if its is None else _round(its),
+            "expected_energy_j": None if energy is None else _round(energy)}
 
 
 def time_spent(record: Record, robot: int) -> dict[str, float | None]:

@@ -16,10 +16,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.robots.base import Floats, Height, RobotKind
+from moonteam.robots.base import Floats, Height, Pace, RobotKind
 
 LEAST = 0.05
 """Below this distance, m, there is no slip to speak of."""
+
+STRIDE = 0.2
+"""m over which the slope along a way is taken."""
 
 
 def slip(kind: RobotKind, qpos: npt.NDArray, height: Height | None = None) -> float | None:
@@ -38,6 +41,32 @@ def slip(kind: RobotKind, qpos: npt.NDArray, height: Height | None = None) -> fl
     counted, real = ways
     longer = max(counted, real)
     return (counted - real) / longer if longer >= LEAST else None
+
+
+def expected(pace: Pace, qpos: npt.NDArray, height: Height) -> tuple[float | None, float | None]:
+    """Slip, and energy J, that a robot's way [T, 7 + joints] takes by what is known of its kind on
+    this soil, from the ground's slope along it; None where that is not known.
+    """
+    qpos = np.asarray(qpos, np.float64)
+    xy = qpos[np.isfinite(qpos).all(axis=1)][:, :2]
+    if len(xy) < 2 or not pace.slopes:
+        return None, None
+    # Steps too short to have a direction are left out.
+    kept = [0]
+    for i in range(1, len(xy)):
+        if np.hypot(*(xy[i] - xy[kept[-1]])) >= STRIDE:
+            kept.append(i)
+    way = xy[kept]
+    metres = np.hypot(*np.diff(way, axis=0).T)
+    if metres.sum() < LEAST:
+        return None, None
+    slope = np.arctan2(np.diff(height(way)), metres)
+    energy = float((np.interp(slope, pace.slopes, pace.energy) * metres).sum())
+    if not pace.slip:
+        return None, energy
+    share = np.clip(np.interp(slope, pace.slopes, pace.slip), -1.0, 0.95)
+    counted = np.where(share > 0.0, metres / (1.0 - share), metres * (1.0 + share)).sum()
+    return float((counted - metres.sum()) / max(counted, metres.sum())), energy
 
 
 def ground_height(heights: npt.NDArray, spacing: float) -> Height:

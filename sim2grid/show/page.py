@@ -196,10 +196,11 @@ def _targets(report: Report) -> str:
 def _robots(report: Report) -> str:
     return known(
         ["robot", "kind", "skills", "moves", "s a move", "way m", "off track rms m", "95 % m",
-         "tilt deg", "slip", "late", "wrong cell", "energy kJ", "propellant g", "lost"],
+         "tilt deg", "slip", "slip expected", "late", "wrong cell", "energy kJ",
+         "propellant g", "lost"],
         [(name_of_robot(i, r.name), r.kind, held(r.skills), r.moves, r.seconds_per_move,
           r.distance_m, r.cross_track_rms_m, r.cross_track_p95_m, r.max_tilt_deg, r.slip,
-          r.timeouts, r.wrong_cells, r.energy_j / 1000, r.propellant_kg * 1000,
+          r.expected_slip, r.timeouts, r.wrong_cells, r.energy_j / 1000, r.propellant_kg * 1000,
           None if r.lost is None else f"{r.lost.replace('_', ' ')} at {r.lost_s:.1f} s")
          for i, r in enumerate(report.robots)])
 

@@ -206,7 +206,12 @@ def make_fleet(recipe: Recipe | Given, count: int,
     if isinstance(recipe, Given):
         return fleet_of_one(recipe.mission(), recipe.name)
     site, passable = ground_of(recipe, change)
-    drawn = [draw_mission(recipe, number, site, passable) for number in range(count)]
+    able = passable
+    if not site.known:
+        # The same missions whatever is believed of the ground.
+        measured = msgspec.structs.replace(recipe.site, fields="measured")
+        _, able = ground_of(replace(recipe, ground=measured), change)
+    drawn = [draw_mission(recipe, number, site, able) for number in range(count)]
     chosen, kinds = [mission for mission, _ in drawn], crew(recipe)
     fleet = fleet_of(chosen, [draws for _, draws in drawn], site, passable, kinds)
     files = {kinds[i].name: os.fspath(Path(written).resolve())

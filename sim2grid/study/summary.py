@@ -102,6 +102,7 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
             robot.energy_j for robot in row.report.robots) / 1e3, won)),
         "propellant_kg": boot.mean(values(lambda row: sum(
             robot.propellant_kg for robot in row.report.robots), won)),
+        **{key: boot.mean(values(partial(_on_soil, key=key), won)) for key in ON_SOIL_KEYS},
     }
     causes = Counter(cause for row in rows for cause, n in row.report.replans.items()
                      for _ in range(n))
@@ -119,6 +120,13 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
 def _a_robot(row: Row, key: str) -> float | None:
     """A figure of the robots' reports, in the mean of the robots."""
     return _mean([getattr(robot, key) for robot in row.report.robots])
+
+
+def _on_soil(row: Row, key: str) -> float | None:
+    """A figure of those robots of which it is known what to expect on the mission's soil."""
+    return _mean([getattr(robot, key) for robot in row.report.robots
+                  if robot.expected_energy_j is not None
+                  and (robot.expected_slip is not None or "energy" in key)])
 
 
 def legs_sent(robot: RobotReport) -> int:
@@ -250,6 +258,11 @@ TIME_SPENT = ["site", "planner", "s of a mission", "a robot drives, by the groun
 """Of the mean robot. Slower: speeding up, coming to rest, making way. Standing: waiting for others,
 or done.
 """
+ON_SOIL_KEYS = ("slip", "expected_slip", "energy_j", "expected_energy_j")
+ON_SOIL = ["site", "planner", "slip of wheels", "expected", "energy of a robot, J", "expected"]
+"""On regolith: of robots on the ground; expected: by `moonteam evaluate paces`, from the slopes of
+the ways that they took.
+"""
 MISSIONS = ["mission", "contender", "came to", "s", "s at best, as planned", "decisions"]
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
             "seconds, ratio", "seconds more", "moves, ratio"]
@@ -296,6 +309,10 @@ def tables(report: dict[str, Any]) -> list[Plain]:
             spread(line, "service_s", 1),
             _value(line["seconds"] - line["driving_s"] - line["service_s"], 1),
             _value(line["replans"], 2)] for line in clocked if line["driving_s"] is not None]))
+    if soft := [line for line in report["summary"] if line.get("expected_energy_j") is not None]:
+        found.append((ON_SOIL, [[
+            where(line), line["planner"], *(spread(line, key, 2) for key in ON_SOIL_KEYS[:2]),
+            *(spread(line, key, 0) for key in ON_SOIL_KEYS[2:])] for line in soft]))
     if report["options"].get("mission"):
         found.append((MISSIONS, [[
             f"{row['number']} {row['report']['mission']}", row["contender"],
@@ -357,7 +374,8 @@ def flat_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
         for robot in report.robots:
             for key in ("kind", "lost", "moves", "arrivals", "timeouts", "wrong_cells",
                         "seconds_per_move", "cross_track_rms_m", "cross_track_p95_m",
-                        "max_tilt_deg", "slip", "distance_m", "energy_j", "propellant_kg"):
+                        "max_tilt_deg", "slip", "expected_slip", "distance_m", "energy_j",
+                        "propellant_kg"):
                 flat[f"{robot.name}_{key}"] = getattr(robot, key)
         found.append(flat)
     return found

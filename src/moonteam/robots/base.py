@@ -74,6 +74,9 @@ class Pace(NamedTuple):
     speed: float  # m/s on the level
     max_slope: float  # rad, beyond which it must not go
     slowing: float  # share of its speed lost there, in proportion to the slope
+    slopes: tuple[float, ...] = ()  # rad along its way, downhill below 0, ascending, of
+    slip: tuple[float, ...] = ()  # its wheels' slip there; none: it has no wheels, and
+    energy: tuple[float, ...] = ()  # J/m there
 
 
 class Camera(NamedTuple):
@@ -151,8 +154,9 @@ class RobotKind:
 def paces_of(name: str) -> dict[str, Pace]:
     """The bundled paces of a kind by soil, as `moonteam evaluate paces` has measured them."""
     soils = files.read_json(assets() / "robots" / "paces.json")["soils"]
-    return {soil: Pace(**by_kind[name]["pace"]) for soil, by_kind in soils.items()
-            if name in by_kind}
+    return {soil: Pace(*(tuple(x) if isinstance(x, list) else x
+                         for x in by_kind[name]["pace"].values()))
+            for soil, by_kind in soils.items() if name in by_kind}
 
 
 def times(matrix: Array, vector: Array) -> Array:

@@ -150,7 +150,12 @@ def pace_of(kind: RobotKind, drives: Sequence[Drive]) -> Pace:
                                           if d.degrees == slope])) for slope in used]
     share = np.array(used) / max(steepest, 1e-9)
     slowing = float(np.clip((share @ np.array(lost)) / (share @ share), 0.0, 0.95))
-    return Pace(round(level, 3), round(math.radians(steepest), 4), round(slowing, 3))
+    along = sorted((-d.degrees if d.way == "down" else d.degrees, d) for d in drives
+                   if d.way != "across" and d.through)
+    return Pace(round(level, 3), round(math.radians(steepest), 4), round(slowing, 3),
+                tuple(round(math.radians(slope), 4) for slope, _ in along),
+                tuple(round(d.slip, 3) for _, d in along if d.slip is not None),
+                tuple(round(d.energy_j_per_m, 2) for _, d in along))
 
 
 def table(found: dict[str, dict[str, list[Drive]]], kinds: dict[str, RobotKind]
