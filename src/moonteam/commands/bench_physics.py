@@ -48,6 +48,9 @@ class Args(Reported):
     site: str = "mare"
     """preset of the ground"""
 
+    ground: tuple[Literal["rigid", "regolith"], ...] = ("rigid",)
+    """rigid, or regolith that wheels and feet sink into; or both, in turn"""
+
     samples: int = 129
     """elevation samples along each side of the ground, 0.25 m apart"""
 
@@ -75,16 +78,19 @@ def run(args: Args) -> int:
     from moonteam.physics.trials import speed
     from moonteam.report.tables import plain_markdown, print_as, save_plain
 
-    scene = speed.own_robots(args.site, args.seed, args.samples)
+    scenes = {ground: speed.own_robots(args.site, args.seed, args.samples, ground)
+              for ground in dict.fromkeys(args.ground)}
     rows = []
     for name, batch, threads in _loads(args):
-        rows.append(speed.measure(scene, name, batch, args.seconds, threads))
-        if not (args.json or args.markdown):
-            _show(rows[-1])
+        for ground, scene in scenes.items():
+            rows.append({"ground": ground}
+                        | speed.measure(scene, name, batch, args.seconds, threads))
+            if not (args.json or args.markdown):
+                _show(rows[-1])
     site = ["--site", args.site, "--samples", str(args.samples), "--seed", str(args.seed)]
     compiled = [speed.compile_times(name, 1, site)
                 for name in dict.fromkeys(args.backend)] if args.compilation else []
-    report = _document(args, scene, rows, compiled)
+    report = _document(args, next(iter(scenes.values())), rows, compiled)
     if args.out is not None:
         save_plain(args.out, "bench_physics", report, tables(report))
     print_as(args, report, lambda: plain_markdown(report, tables(report)),
@@ -125,9 +131,10 @@ def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) 
 
 def tables(document: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
     """Titles and rows: speeds, and times to compile if they were taken."""
-    titles = ["engine", "worlds", "threads", "steps/s", "physics alone", "controllers add",
+    grounds = len({row["ground"] for row in document["rows"]}) > 1
+    titles = ["engine", *(["ground"] if grounds else []), "worlds", "threads", "steps/s", "physics alone", "controllers add",
               "times real time", "CPU", "memory, MB"]
-    rows = [[row["backend"], str(row["worlds"]), str(row.get("threads", "")),
+    rows = [[row["backend"], *([row["ground"]] if grounds else []), str(row["worlds"]), str(row.get("threads", "")),
              f"{row['steps_per_s']:,.0f}", f"{row['physics_steps_per_s']:,.0f}",
              f"{100 * row['controllers_add']:.0f} %", f"{row['real_time_factor']:,.1f}",
              f"{row['cpu_s']:.4f} s", f"{row['peak_memory_mb']:,.0f}"]
@@ -148,7 +155,8 @@ def _show_compiled(compiled: list[dict[str, Any]]) -> None:
 
 def _show(row: dict[str, Any]) -> None:
     threads = f", {row['threads']} threads" if "threads" in row else ""
-    print(f"{row['backend']}, {row['worlds']} worlds{threads}: {row['steps_per_s']:,.0f} steps/s, "
+    print(f"{row['backend']}, {row['ground']}, {row['worlds']} worlds{threads}: "
+          f"{row['steps_per_s']:,.0f} steps/s, "
           f"{row['real_time_factor']:,.1f} times real time, compiled in {row['compile_s']:.1f} s; "
           f"physics alone {row['physics_steps_per_s']:,.0f} steps/s, controllers add "
           f"{100 * row['controllers_add']:.0f} %; {row['cpu_s']:.4f} s of CPU a simulated second "

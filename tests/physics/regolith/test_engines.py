@@ -63,7 +63,8 @@ def test_a_wheel_that_has_sunk_stands_lower():
     engine = make_backend("native", scene, threads=1)
     state, log = engine.advance(engine.reset(), hold(scene, 1), 500)
     depth = np.asarray(log.treads)[0, -1, :, 1]
-    assert (depth > 0.0005).all() and (depth < 0.02).all()
+    assert (depth > 0.0005).all()
+    assert (depth < 0.02).all()
     load = np.asarray(log.treads)[0, -1, :, 2]
     assert load.sum() == pytest.approx(MASS * GRAVITY, rel=0.02), "the contact carries the weight"
     data = mujoco.MjData(scene.model)
@@ -125,5 +126,6 @@ def test_every_sphere_of_a_kind_that_meets_the_ground_is_a_tread(kind):
     meets = [g for g in range(model.ngeom) if model.geom_bodyid[g] and model.geom_contype[g] == 0
              and model.geom_conaffinity[g] == 1]
     assert sorted(scene.treads.geoms) == meets
-    assert scene.bed is not None and scene.bed.table.shape[0] == len(meets)
+    assert scene.bed is not None
+    assert scene.bed.table.shape[0] == len(meets)
     assert bool(np.asarray(scene.bed.rolls).all()) == KINDS.get(kind).tread.rolls

@@ -61,7 +61,8 @@ def test_a_wheel_that_rolls_steadily_pulls_as_the_table_says(slip):
 def test_it_pulls_back_when_it_is_braked_and_to_the_side_when_it_slides():
     _, step = made(WHEEL)
     braked, _, told = steady(step, felt((0.4, 0, 0), (0, 0.2 / TIP, 0), height=0.12))
-    assert float(told.slip[0]) == pytest.approx(-0.5, abs=1e-3) and braked[0] < -0.5
+    assert float(told.slip[0]) == pytest.approx(-0.5, abs=1e-3)
+    assert braked[0] < -0.5
     aside, _, _ = steady(step, felt((0.3, 0.3, 0), (0, 0.3 / TIP, 0), height=0.12))
     assert aside[1] < -0.5 * abs(aside[0]) - 0.5
     assert aside[3] != 0.0, "at the rim, not at the axle"
@@ -87,11 +88,13 @@ def test_a_standing_foot_is_held_like_a_spring_until_the_soil_shears():
 def test_a_lifted_foot_feels_nothing_and_comes_down_on_fresh_soil():
     _, step = made(FOOT)
     _, memory, _ = steady(step, felt((0.05, 0, 0)))
-    assert abs(float(memory.moved[0, 0])) > 0.01 and float(memory.depth[0]) > 0
+    assert abs(float(memory.moved[0, 0])) > 0.01
+    assert float(memory.depth[0]) > 0
     for _ in range(400):
         forces, memory, told = step(FLAT, memory, felt((0.5, 0, 0.3), load=0.0, height=0.5))
     assert np.abs(np.asarray(forces)).max() < 1e-5
-    assert float(memory.depth[0]) < 1e-4 and float(told.load[0]) < 1e-6
+    assert float(memory.depth[0]) < 1e-4
+    assert float(told.load[0]) < 1e-6
 
 
 def test_what_stands_on_a_rock_gets_nothing_from_the_soil():

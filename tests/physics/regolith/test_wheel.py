@@ -90,5 +90,6 @@ def test_the_nominal_soil_is_what_a_fit_comes_to():
 
 
 def test_published_points_are_where_the_sources_have_them():
-    assert RASHID.pull[0] == 8.1 and RASHID.sinkage[-1] == 0.0195
+    assert RASHID.pull[0] == 8.1
+    assert RASHID.sinkage[-1] == 0.0195
     assert len(VIPER.degrees) == len(VIPER.slip) == 6

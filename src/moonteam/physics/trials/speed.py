@@ -23,16 +23,19 @@ from moonteam.physics.backends import Backend, Commands, NativeBackend, hold, ma
 from moonteam.physics.scene import Placement, Scene, build_scene
 from moonteam.robots import KINDS, OWN
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind, Telemetry
-from moonteam.terrain.site import make_site
+from moonteam.terrain.site import make_site, with_soil
 from moonteam.terrain.surface import Surface
 
 SPREAD = 3.0
 """Distance between robots at the start, m."""
 
 
-def own_robots(preset: str, seed: int, samples: int) -> Scene:
-    """One robot of each kind of ours on a site of samples x samples at 0.25 m."""
+def own_robots(preset: str, seed: int, samples: int, ground: str = "rigid") -> Scene:
+    """One robot of each kind of ours on a site of samples x samples at 0.25 m; `ground` as in a
+    mission.
+    """
     site = make_site(preset, seed, (samples - 1) * 0.25)
+    site = with_soil(site, "nominal") if ground == "regolith" else site
     return build_scene(site, [Placement(name, KINDS.get(name), (SPREAD * (i - 1), 0.0))
                               for i, name in enumerate(OWN)])
 
