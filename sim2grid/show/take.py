@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam.problem.mission import Mission
+from moonteam.robots.base import SOLE, Tread
 from sim2grid.frame import Frame
 from sim2grid.loop.record import SETTING_OUT, Record
 from sim2grid.show.picture import Ground
@@ -48,6 +49,7 @@ class Actor:
     radius: float = 0.5  # m about the base, all of it
     distance: float = 2.9  # m from which it is shown
     body: int = 0  # its root in the model
+    tread: Tread = SOLE
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def actors_of(prepared: Prepared) -> tuple[Actor, ...]:
             reach = max(reach, float(at + min(model.geom_rbound[geom], 0.3)))
         found.append(Actor(robot.qpos.start, robot.kind.glyph, robot.kind.flies,
                            min(reach, 1.5 * robot.kind.footprint + 0.5),
-                           robot.kind.camera.distance, robot.body))
+                           robot.kind.camera.distance, robot.body, robot.kind.tread))
     return tuple(found)
 
 

@@ -32,6 +32,7 @@ from sim2grid.show.picture import (
     requirement,
     robot_color,
 )
+from sim2grid.show.ruts import ruts_of
 
 Rgba = tuple[float, float, float, float]
 Points = npt.NDArray[np.float64]
@@ -80,6 +81,11 @@ class SceneViews:
         self._stands: dict[int, _Stand] = {}
         self._thrusters = [_thrusters(self.take.model, robot.name)
                            for robot in film.mission.robots]
+        soft = film.mission.site.ground == "regolith"
+        treads = {robot.name: actor.tread for robot, actor in zip(
+            film.mission.robots, self.take.actors, strict=True)}
+        self._ruts = ruts_of(self.take.model, film.times, film.qpos, treads,
+                             self.height) if soft else None
         rates = np.concatenate(film.record.propellant)
         self._burning = rates / np.maximum(rates.max(axis=0, initial=0.0), 1e-9)  # [T, R]
 
@@ -87,6 +93,7 @@ class SceneViews:
         """What a shot's camera sees, `share` of the shot being over."""
         view = self._view(shot, share, moment, qpos)
         markers, lines = self._ground_part(moment)
+        markers += self._ruts.until(moment.time_s) if self._ruts else []
         markers += self._plumes(moment, qpos)
         casters = self._casters(view, qpos) if self.film.style.shadows else ()
         picture, depth = self.stage.frame(qpos, view, markers, lines, casters)

@@ -132,9 +132,10 @@ def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) 
 def tables(document: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
     """Titles and rows: speeds, and times to compile if they were taken."""
     grounds = len({row["ground"] for row in document["rows"]}) > 1
-    titles = ["engine", *(["ground"] if grounds else []), "worlds", "threads", "steps/s", "physics alone", "controllers add",
-              "times real time", "CPU", "memory, MB"]
-    rows = [[row["backend"], *([row["ground"]] if grounds else []), str(row["worlds"]), str(row.get("threads", "")),
+    titles = ["engine", *(["ground"] if grounds else []), "worlds", "threads", "steps/s",
+              "physics alone", "controllers add", "times real time", "CPU", "memory, MB"]
+    rows = [[row["backend"], *([row["ground"]] if grounds else []), str(row["worlds"]),
+             str(row.get("threads", "")),
              f"{row['steps_per_s']:,.0f}", f"{row['physics_steps_per_s']:,.0f}",
              f"{100 * row['controllers_add']:.0f} %", f"{row['real_time_factor']:,.1f}",
              f"{row['cpu_s']:.4f} s", f"{row['peak_memory_mb']:,.0f}"]

@@ -131,10 +131,10 @@ def pace_of(kind: RobotKind, drives: Sequence[Drive]) -> Pace:
     slopes = sorted({d.degrees for d in drives if d.degrees})
 
     def climbing(slope: float) -> float:
-        """Speed uphill; 0 unless all drives made it, up, down and across."""
+        """Speed uphill; 0 unless most drives made it, up, down and across."""
         mine = [d for d in drives if d.degrees == slope]
         ups = [d.speed_mps for d in mine if d.way == "up"]
-        return ups[0] if all(d.through == d.count for d in mine) else 0.0
+        return ups[0] if all(2 * d.through > d.count for d in mine) else 0.0
 
     steepest, before, at_before = 0.0, level, 0.0
     for slope in slopes:
