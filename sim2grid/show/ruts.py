@@ -30,7 +30,7 @@ THICK = 0.004  # m
 NEAR = 0.015
 """A tread this near to the ground, m, is in it."""
 
-DARK = (0.06, 0.055, 0.05, 0.30)
+DARK = (0.07, 0.065, 0.06, 0.14)
 STANDING = 0.04
 """Slower than this, m/s, a foot stands."""
 

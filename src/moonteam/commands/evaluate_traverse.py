@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from moonteam.commands.options import Reported
 from moonteam.errors import InputError
 from moonteam.files import replacing
+from moonteam.problem.mission import SoilName
 from moonteam.report.command import Aside
 from moonteam.report.progress import busy
 
@@ -49,6 +50,12 @@ class Args(Reported):
     site: str = "mare"
     """preset of the ground"""
 
+    ground: Literal["rigid", "regolith"] = "rigid"
+    """rigid, or regolith that wheels and feet sink into"""
+
+    soil: SoilName = "nominal"
+    """of regolith; its strength is drawn anew for each site"""
+
     count: int = 50
     """traverses a kind"""
 
@@ -75,6 +82,8 @@ def run(args: Args) -> int:
         raise InputError("--count and --sites", "must be at least 1")
     if not 1.0 <= args.length <= 200.0:
         raise InputError("--length", f"{args.length:g} m; allowed: 1 to 200")
+    if args.ground == "rigid" and args.soil != Args().soil:
+        raise InputError("--soil", "is of --ground regolith, which is not given")
     if args.video and not args.out:
         raise InputError("--video", "needs a folder to write into: --out DIR")
     from moonteam.compilation import call_at_once, enable_cache
@@ -122,13 +131,14 @@ def _run_kind(args: Args, kind: RobotKind, stills: list) -> tuple[list[Traverse]
 
     from moonteam.physics.trials.film import choose
     from moonteam.physics.trials.traverse import draw_routes, run_traverses
-    from moonteam.terrain.site import make_site
+    from moonteam.terrain.site import make_site, with_soil
 
     places, total = [], 0
     seeds = _seeds(args)
     for index, seed in enumerate(seeds):
         share = args.count // len(seeds) + (index < args.count % len(seeds))
         site = make_site(args.site, seed, args.length + EXTENT)
+        site = with_soil(site, args.soil) if args.ground == "regolith" else site
         rng = np.random.default_rng([args.seed, seed])
         routes, draws = draw_routes(kind, site, share, args.length, rng)
         places.append((site, routes))
@@ -201,7 +211,17 @@ def _page(summaries: list[dict]) -> tuple[list[str], list[list[str]]]:
         "p95, m": "{cross_track_p95_m:.3f}", "energy, J/m": "{energy_j_per_m:.1f}",
         "propellant, g": "{propellant_g:.1f}", "tilt p95, deg": "{tilt_p95_deg:.1f}",
         "tilt max, deg": "{tilt_max_deg:.1f}", "routes drawn": "{route_draws}"}
+    if any(summary["sinkage_m"] is not None for summary in summaries):
+        # Whoever sinks in has slipped, if it has wheels.
+        means |= {"slip of wheels": "{slip_said}", "sinkage, mm": "{sinkage_said}"}
+        summaries = [summary | {"slip_said": _said(summary["slip"], 1.0, 3),
+                                "sinkage_said": _said(summary["sinkage_m"], 1e3, 1)}
+                     for summary in summaries]
     rows = [[text.format(**summary) for text in columns.values()]
             + [text.format(**summary) if summary["arrived"] else "-" for text in means.values()]
             for summary in summaries]
     return [*columns, *means], rows
+
+
+def _said(value: float | None, factor: float, digits: int) -> str:
+    return "-" if value is None else f"{factor * value:.{digits}f}"

@@ -1,5 +1,7 @@
 """A hand-made trajectory whose every metric is known by arithmetic."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from moonteam.terrain.surface import Surface
 from sim2grid.frame import Frame, tilt
 from sim2grid.loop.record import Decision, Leg, Loss, Record, Solve
 from sim2grid.measure.metrics import GridPlan, Track, cross_track, make_report
-from sim2grid.measure.slip import ground_height, slip
+from sim2grid.measure.slip import expected, ground_height, slip
 
 
 def quat_about_x(angle):
@@ -161,6 +163,27 @@ def test_slip_of_feet_that_hold_slide_or_do_not_touch():
     sledge = pendulum(1.0)[[20] * 41]
     sledge[:, 0] = np.linspace(0.0, HIP_X, 41)
     assert slip(LEGGED, sledge, flat) == pytest.approx(-1.0)
+
+
+def test_what_a_way_on_regolith_is_expected_to_take_follows_the_slopes_along_it():
+    """Up 4 degrees and down again: what is known of both slopes, weighted by their lengths."""
+    slope = math.radians(4.0)
+
+    def ridge(xy):
+        return np.tan(slope) * (2.0 - np.abs(xy[..., 0] - 2.0))
+
+    pace = WHEELED.paces["nominal"]
+    x = np.linspace(0.0, 4.0, 401)
+    its, energy = expected(pace, rover(x, x), ridge)
+    up, down = (float(np.interp(s, pace.slopes, pace.slip)) for s in (slope, -slope))
+    counted = 2.0 / (1.0 - up) + 2.0 * (1.0 + min(down, 0.0))
+    assert its == pytest.approx((counted - 4.0) / counted, abs=0.02)
+    joules = [float(np.interp(s, pace.slopes, pace.energy)) for s in (slope, -slope)]
+    assert energy == pytest.approx(2.0 * sum(joules), rel=0.05)
+    legs, spent = expected(LEGGED.paces["nominal"], rover(x, x), ridge)
+    assert legs is None
+    assert spent > 60.0
+    assert expected(pace, rover(0 * x, x), ridge) == (None, None), "never moved"
 
 
 def test_the_ground_under_feet_is_the_surface_of_the_physics():

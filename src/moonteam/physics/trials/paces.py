@@ -21,7 +21,7 @@ import numpy.typing as npt
 from moonteam.physics.backends import make_backend
 from moonteam.physics.scene import Placement, build_scene, start_pose
 from moonteam.physics.trials.slopes import LEVEL, SLOPED, incline, routes
-from moonteam.physics.trials.traverse import LOG_EVERY, SAMPLE_SECONDS
+from moonteam.physics.trials.traverse import BEARS, LOG_EVERY, SAMPLE_SECONDS
 from moonteam.robots.base import Command, Pace, RobotKind
 from moonteam.terrain.site import Site
 from moonteam.terrain.soil import Soil
@@ -110,7 +110,7 @@ def _row(kind: RobotKind, degrees: float, way: str, x: Floats, power: Floats, tr
             1.0 if way == "across" else math.cos(math.radians(degrees)))
         speed.append(metres / seconds)
         energy.append(power[b][at].sum() * SAMPLE_SECONDS / metres)
-        borne = treads[b][at][..., 2] > 0.1
+        borne = treads[b][at][..., 2] > BEARS
         slip.append(float(treads[b][at][..., 0][borne].mean()))
         depth.append(float(treads[b][at][..., 1][borne].mean()))
 

@@ -31,6 +31,7 @@ REST_SECONDS = 3.0  # still watched after the arrival, to see where it comes to 
 PATIENCE = 4.0  # times the time at the kind's own speed
 LOG_EVERY = 5  # control steps
 SAMPLE_SECONDS = CONTROL_PERIOD * LOG_EVERY
+BEARS = 0.1  # N on a wheel or foot
 MARGIN = 3.0  # m from the site's border
 BATCHES, BATCH = 20, 100  # routes drawn at most, routes judged at once
 
@@ -68,6 +69,8 @@ class Traverse:
     propellant_g: float
     tilt_p95_deg: float
     tilt_max_deg: float
+    slip: float | None = None  # on regolith: of its wheels, in the mean of those that bear
+    sinkage_m: float | None = None  # on regolith: of what bears
 
 
 class Recording(NamedTuple):
@@ -111,7 +114,7 @@ def _passable(kind: RobotKind, site: Site, start: np.ndarray, goal: np.ndarray) 
 
     The robot may stray to either side, and it must be able to stand at both ends.
     """
-    limits = kind.limits
+    limits = kind.limits_on(site.soil.name if site.soil else None)
     way = goal - start
     length = float(np.linalg.norm(way[0]))
     aside = STRAY / length * np.stack([-way[:, 1], way[:, 0]], axis=1)
@@ -151,7 +154,7 @@ def run_traverses(
     for _ in range(math.ceil(PATIENCE * length / kind.speed)):
         state, log = engine.advance(state, command, chunk)
         judge.add(np.asarray(log.qpos), np.asarray(log.power), np.asarray(log.propellant_rate),
-                  np.asarray(state.diverged))
+                  np.asarray(log.treads), np.asarray(state.diverged))
         poses.append(np.asarray(log.qpos)[list(record)])
         watch(judge.seconds)
         if judge.done:
@@ -174,6 +177,7 @@ class _Judge:
         self._tilt: list[np.ndarray] = []
         self._power: list[np.ndarray] = []
         self._propellant: list[np.ndarray] = []
+        self._treads: list[np.ndarray] = []
 
     @property
     def seconds(self) -> float:
@@ -189,13 +193,16 @@ class _Judge:
                    for end in self._ends)
 
     def add(self, qpos: np.ndarray, power: np.ndarray, propellant: np.ndarray,
-            diverged: np.ndarray) -> None:
-        """A stretch of log: qpos [B, T, nq], power and propellant [B, T, 1]; diverged [B]."""
+            treads: np.ndarray, diverged: np.ndarray) -> None:
+        """A stretch of log: qpos [B, T, nq], power and propellant [B, T, 1], treads [B, T, C, 3];
+        diverged [B].
+        """
         x, y = qpos[..., 4], qpos[..., 5]
         self._xy.append(qpos[..., :2])
         self._tilt.append(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))
         self._power.append(power[..., 0])
         self._propellant.append(propellant[..., 0])
+        self._treads.append(treads)
         xy, tilt = np.concatenate(self._xy, axis=1), np.concatenate(self._tilt, axis=1)
         for b, end in enumerate(self._ends):
             if end is None:
@@ -219,10 +226,20 @@ class _Judge:
 
     def verdicts(self) -> list[Traverse]:
         """One row a traverse; what has not ended by now is late."""
-        xy, tilt, power, propellant = (np.concatenate(parts, axis=1) for parts in (
-            self._xy, self._tilt, self._power, self._propellant))
-        return [self._row(b, xy[b], np.degrees(tilt[b]), power[b], propellant[b])
-                for b in range(len(self._routes))]
+        xy, tilt, power, propellant, treads = (np.concatenate(parts, axis=1) for parts in (
+            self._xy, self._tilt, self._power, self._propellant, self._treads))
+        return [replace(self._row(b, xy[b], np.degrees(tilt[b]), power[b], propellant[b]),
+                        **self._on_soil(b, treads[b])) for b in range(len(self._routes))]
+
+    def _on_soil(self, b: int, treads: np.ndarray) -> dict[str, float]:
+        """Mean slip and sinkage of what bears, from treads [T, C, 3]; nothing on rigid ground."""
+        _, end = self._ends[b] or ("late", len(treads))
+        slip, depth, load = np.moveaxis(treads[:end], -1, 0)
+        bears = load > BEARS
+        if not bears.any():
+            return {}
+        wheels = {"slip": float(slip[bears].mean())} if self._kind.tread.rolls else {}
+        return wheels | {"sinkage_m": float(depth[bears].mean())}
 
     def _row(self, b: int, xy: np.ndarray, tilt: np.ndarray, power: np.ndarray,
              propellant: np.ndarray) -> Traverse:
@@ -260,8 +277,8 @@ def summarise(rows: Sequence[Traverse]) -> dict[str, Any]:
     summary["arrived_interval"] = wilson(outcomes["arrived"], count)
     arrived = [asdict(r) for r in rows if r.outcome == "arrived"]
     for key in ("speed_mps", "energy_j_per_m", "propellant_g", "rest_error_m",
-                "cross_track_rms_m", "cross_track_p95_m", "tilt_p95_deg"):
-        values = np.array([r[key] for r in arrived])
+                "cross_track_rms_m", "cross_track_p95_m", "tilt_p95_deg", "slip", "sinkage_m"):
+        values = np.array([r[key] for r in arrived if r[key] is not None])
         power = 2 if key == "cross_track_rms_m" else 1
         summary[key], summary[key + "_interval"] = _mean(values, power)
     summary["cross_track_max_m"] = max((r["cross_track_max_m"] for r in arrived), default=None)
