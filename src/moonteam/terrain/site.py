@@ -22,6 +22,7 @@ import trimesh
 from moonteam.errors import InputError, meant
 from moonteam.problem.mission import Mission
 from moonteam.problem.piece import WHOLE, Piece
+from moonteam.problem.sun import SunPosition
 from moonteam.terrain import dem, generate
 from moonteam.terrain.surface import Surface
 
@@ -71,6 +72,7 @@ class Site:
     spacing: float  # m
     boulders: tuple[Boulder, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict)
+    sun: SunPosition | None = None  # None: nobody asks for it, and pictures have their own
 
     @functools.cached_property
     def surface(self) -> Surface:
@@ -139,9 +141,14 @@ def rough_ground(shape: tuple[int, int], rms: float, seed: int, spacing: float) 
 def for_mission(mission: Mission, spacing: float = SPACING, source: object = None) -> Site:
     """The ground that a mission asks for: its map plus a margin, map centre = site centre.
 
-    An elevation model has to cover the map alone. Raises InputError naming `source`, where one is
-    given, and the key.
+    An elevation model has to cover the map alone. The sun is the mission's. Raises InputError
+    naming `source`, where one is given, and the key.
     """
+    site = _ground_for(mission, spacing, source)
+    return site if mission.sun is None else replace(site, sun=mission.sun.position())
+
+
+def _ground_for(mission: Mission, spacing: float, source: object) -> Site:
     width, height = (n * mission.map.cell_m for n in mission.map.size)
     its = mission.site
     try:
