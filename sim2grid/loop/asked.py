@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,16 @@ NOBODY = 1 << 30
 """Bit of a skill that no robot has."""
 
 
+class Sunlight(Protocol):
+    """The light on a piece of ground, `terrain.light.Sunlight`."""
+
+    elevation: float  # rad, of the sun
+
+    def at(self, xy: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        """[...] whether a robot's panel has light at xy [..., 2] m."""
+        ...
+
+
 @dataclass(frozen=True)
 class Body:
     """What the executor needs to know of a simulated robot."""
@@ -35,6 +45,7 @@ class Body:
     footprint: float = 0.3  # m, radius
     settle: float = 0.0  # s that setting out and coming to rest cost it
     lands_for: float = float("inf")  # s of service from which it comes down for it
+    light: Sunlight | None = None  # on its ground; None: no sun is asked about
 
 
 class Route(NamedTuple):

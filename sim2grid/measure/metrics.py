@@ -80,6 +80,17 @@ class TargetReport(msgspec.Struct, frozen=True):
     expected_s: float | None = None  # by the clock, when the first plan had it solved
 
 
+class BatteryReport(msgspec.Struct, frozen=True):
+    """One robot's power, until the end or until it was lost: start + from_sun - used = end."""
+
+    start_wh: float
+    lowest_wh: float
+    end_wh: float
+    from_sun_wh: float
+    used_wh: float
+    in_shadow: float | None  # share of the time; null where none passed
+
+
 class RobotReport(msgspec.Struct, frozen=True):
     """One robot. Rates and means are null where there was nothing to measure."""
 
@@ -107,6 +118,7 @@ class RobotReport(msgspec.Struct, frozen=True):
     driving_s: float | None = None  # by the clock: on its ways,
     slower_s: float | None = None  # of which so much more than the ground says,
     service_s: float | None = None  # and in services
+    battery: BatteryReport | msgspec.UnsetType = msgspec.UNSET  # not in the file without one
 
 
 class GridPlan(msgspec.Struct, frozen=True):
@@ -199,7 +211,18 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
         distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
         energy_j=_round(float((track.power[1:] * steps).sum())),
         propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6),
-        **time_spent(record, robot))
+        battery=battery_report(record, robot), **time_spent(record, robot))
+
+
+def battery_report(record: Record, robot: int) -> BatteryReport | msgspec.UnsetType:
+    """One robot's power; unset where it has no battery."""
+    its = record.charges.get(robot)
+    if its is None:
+        return msgspec.UNSET
+    return BatteryReport(
+        start_wh=_round(its.start_wh), lowest_wh=_round(its.lowest_wh), end_wh=_round(its.now_wh),
+        from_sun_wh=_round(its.gained_wh), used_wh=_round(its.used_wh),
+        in_shadow=_round(its.dark_s / its.counted_s) if its.counted_s else None)
 
 
 def time_spent(record: Record, robot: int) -> dict[str, float | None]:

@@ -132,7 +132,8 @@ def mission_data(story: Story, prepared: Prepared, rate: float) -> str:
     half = [n * frame.cell_m / 2 for n in frame.size]
     head = {
         "seconds": story.record.seconds(), "half": half, "cell": frame.cell_m,
-        "sun": [look.SUN_AZIMUTH, look.SUN_ELEVATION],
+        "sun": [look.bearing(site.sun), look.SUN_ELEVATION if site.sun is None
+                else look.shown(site.sun).elevation],
         "colours": {"open": hexed(OPEN), "solved": hexed(SOLVED), "replan": hexed(REPLAN),
                     "serving": hexed(STATES["late"])},
         "ground": _ground(site, prepared.barred(), half, frame.cell_m, block),

@@ -11,6 +11,7 @@ spacings from the first sample, heights in metres.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +57,27 @@ def lit_at(site: Site, sun: SunPosition, xy: npt.ArrayLike, above: float = 0.0) 
     found = _lit(site.heights.astype(np.float64), site.spacing, places.reshape(-1, 2), above,
                  np.array(sun.toward), rocks.reshape(-1, 4))
     return found.reshape(points.shape[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Sunlight:
+    """The light that robots' panels have on a site that has a sun."""
+
+    site: Site
+
+    @property
+    def elevation(self) -> float:
+        """Of the sun, rad."""
+        return self._sun.elevation
+
+    @property
+    def _sun(self) -> SunPosition:
+        assert self.site.sun is not None
+        return self.site.sun
+
+    def at(self, xy: npt.ArrayLike) -> Bools:
+        """[...] whether a panel has light at xy [..., 2] m, PANEL above the ground."""
+        return lit_at(self.site, self._sun, xy, PANEL)
 
 
 @njit(cache=True, nogil=True)

@@ -159,8 +159,8 @@ def test_skills_with_names_stand_apart(mission):
 
 def test_hillshade_lights_slopes_that_face_north_west():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
-    facing = hillshade(0.3 * (x - y), 1.0)[10, 10]
-    averted = hillshade(0.3 * (y - x), 1.0)[10, 10]
+    facing = hillshade(Ground(0.3 * (x - y), 1.0))[10, 10]
+    averted = hillshade(Ground(0.3 * (y - x), 1.0))[10, 10]
     assert facing > averted + 50
 
 
