@@ -43,8 +43,10 @@ ROBOTS: tuple[Color, ...] = (
     (64, 196, 255), (255, 214, 64), (236, 120, 255), (120, 255, 214),
     (255, 160, 90), (150, 160, 255), (190, 255, 100), (255, 130, 170))
 
-DARK = 0.45
-"""Brightness of ground in shadow, that of the same ground in light being 1."""
+DARK = 0.4
+"""Brightness of ground in shadow, that of the same ground in light being 1; ground over which a
+robot's panel alone has light is halfway.
+"""
 
 SMOOTH = 2
 """Drawn this many times larger, then reduced: smooth edges."""
@@ -74,16 +76,17 @@ class Ground:
     heights: npt.NDArray
     spacing: float
     sun: SunPosition | None = None
-    lit: npt.NDArray[np.bool_] | None = None  # [ny, nx] in that sun's light
+    light: npt.NDArray | None = None  # [ny, nx] 1 lit by it, 0.5 for a robot's panel alone, else 0
 
     @classmethod
     def of(cls, site: Site) -> Ground:
         """That of a site, and the light on it where it has a sun."""
         if site.sun is None:
             return cls(site.heights, site.spacing)
-        from moonteam.terrain.light import lit
+        from moonteam.terrain.light import PANEL, lit
 
-        return cls(site.heights, site.spacing, site.sun, lit(site, site.sun))
+        light = (lit(site, site.sun) + 1.0 * lit(site, site.sun, PANEL)) / 2
+        return cls(site.heights, site.spacing, site.sun, light)
 
 
 def hillshade(ground: Ground) -> npt.NDArray[np.uint8]:
@@ -100,8 +103,9 @@ def hillshade(ground: Ground) -> npt.NDArray[np.uint8]:
     relief = (heights - heights.min()) / max(float(np.ptp(heights)), 1e-6)
     contrast = (shade - light[2]) / max(float(shade.std()), 0.05)  # level ground: none
     bright = np.clip(100 + 22 * contrast + 30 * (relief - 0.5), 15, 200)
-    return (bright if ground.lit is None else np.where(ground.lit, bright, DARK * bright)).astype(
-        np.uint8)
+    if ground.light is not None:
+        bright = bright * (DARK + (1.0 - DARK) * ground.light)
+    return bright.astype(np.uint8)
 
 
 @dataclass(frozen=True)

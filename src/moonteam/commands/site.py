@@ -145,31 +145,30 @@ class _Light:
 
     site: Site
     sun: SunPosition
-    lit: npt.NDArray[Any]  # [ny, nx]
+    lit: npt.NDArray[Any]  # [ny, nx] of the ground
+    panels: npt.NDArray[Any]  # [ny, nx] of robots' panels over it
 
     @property
     def document(self) -> dict[str, float]:
         """Where the sun stands, degrees, and the shares of ground and of panels in its light."""
         import numpy as np
 
-        from moonteam.terrain.light import PANEL, lit
-
         return {"azimuth_deg": round(float(np.degrees(self.sun.azimuth)) % 360, 3),
                 "elevation_deg": round(float(np.degrees(self.sun.elevation)), 3),
                 "lit": round(float(self.lit.mean()), 4),
-                "panels_lit": round(float(lit(self.site, self.sun, PANEL).mean()), 4)}
+                "panels_lit": round(float(self.panels.mean()), 4)}
 
     def draw(self, path: Path) -> Path:
         """The picture."""
         from moonteam.terrain.preview import draw_light
 
-        return draw_light(self.site, path, self.sun, self.lit)
+        return draw_light(self.site, path, self.sun, self.lit, self.panels)
 
 
 def _light(site: Site, sun: SunPosition) -> _Light:
-    from moonteam.terrain.light import lit
+    from moonteam.terrain.light import PANEL, lit
 
-    return _Light(site, sun, lit(site, sun))
+    return _Light(site, sun, lit(site, sun), lit(site, sun, PANEL))
 
 
 def _site(args: Args) -> Site:

@@ -14,7 +14,7 @@ from moonteam import files
 from moonteam.problem.sun import SunPosition
 from moonteam.terrain.measure import roughness_map, slope_map
 from moonteam.terrain.site import Site
-from moonteam.terrain.traversability import FloatMap
+from moonteam.terrain.traversability import BoolMap, FloatMap
 
 EDGE = 1.0
 """Ground kept free around the grid, m: no robot can stand on the very edge."""
@@ -143,10 +143,9 @@ def draw_travel(site: Site, path: Path, title: str, half: tuple[float, float], s
     return path
 
 
-def draw_light(site: Site, path: Path, sun: SunPosition, lit: npt.NDArray[np.bool_]) -> Path:
-    """Which ground the sun lights [ny, nx], over the ground shaded from there; the picture's path.
-
-    An arrow says where the light goes.
+def draw_light(site: Site, path: Path, sun: SunPosition, lit: BoolMap, panels: BoolMap) -> Path:
+    """Which ground the sun lights, and over which a robot's panel has light [ny, nx], on the ground
+    shaded from there; the picture's path. An arrow says where the light goes.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
@@ -157,8 +156,9 @@ def draw_light(site: Site, path: Path, sun: SunPosition, lit: npt.NDArray[np.boo
     place: dict[str, Any] = {"origin": "lower", "extent": box(site)}
     axes.imshow(hillshade(site, azimuth, 25.0), cmap="gray", vmin=0, vmax=1, **place)
     axes.contour(site.heights, levels=8, colors="tab:orange", linewidths=0.5, alpha=0.7, **place)
-    axes.imshow(np.ma.masked_array(np.ones(lit.shape), lit), interpolation="nearest", alpha=0.72,
-                cmap=ListedColormap(["#0b1230"]), **place)
+    for dark, alpha in ((lit, 0.5), (panels, 0.6)):
+        axes.imshow(np.ma.masked_array(np.ones(dark.shape), dark), interpolation="nearest",
+                    alpha=alpha, cmap=ListedColormap(["#0b1230"]), **place)
     _rocks(axes, site)
     east, north, _ = sun.toward
     reach = 0.08 / max(math.hypot(east, north), 1e-9)
@@ -168,7 +168,8 @@ def draw_light(site: Site, path: Path, sun: SunPosition, lit: npt.NDArray[np.boo
                   textcoords="axes fraction",
                   arrowprops={"arrowstyle": "-|>", "color": "gold", "linewidth": 2.2})
     _finish(figure, axes, f"{site.name}, seed {site.seed}: sun {elevation:.1f} degrees high at "
-            f"azimuth {azimuth:.0f}, {100 * lit.mean():.0f} % of the ground lit", path)
+            f"azimuth {azimuth:.0f}, {100 * lit.mean():.0f} % of the ground lit,\n"
+            f"{100 * panels.mean():.0f} % for a robot's panel (darkest: neither)", path)
     return path
 
 
