@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from moonteam.planners.base import IntArray, Planner, Snapshot
 from moonteam.problem.mission import Mission, Target
 from moonteam.problem.scenario import Scenario
+from moonteam.terrain.light import Sunlight
 from sim2grid.frame import Frame
 from sim2grid.loop.replan import with_target
 from sim2grid.loop.rules import Rules
@@ -22,16 +23,6 @@ from sim2grid.loop.rules import Rules
 Mode = Literal["barrier", "async", "clock"]
 NOBODY = 1 << 30
 """Bit of a skill that no robot has."""
-
-
-class Sunlight(Protocol):
-    """The light on a piece of ground, `terrain.light.Sunlight`."""
-
-    elevation: float  # rad, of the sun
-
-    def at(self, xy: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-        """[...] whether a robot's panel has light at xy [..., 2] m."""
-        ...
 
 
 @dataclass(frozen=True)

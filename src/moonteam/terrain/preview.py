@@ -161,10 +161,9 @@ def draw_light(site: Site, path: Path, sun: SunPosition, lit: BoolMap, panels: B
                     alpha=alpha, cmap=ListedColormap(["#0b1230"]), **place)
     _rocks(axes, site)
     east, north, _ = sun.toward
-    reach = 0.08 / max(math.hypot(east, north), 1e-9)
-    middle = np.array([0.88, 0.88])
-    axes.annotate("", middle - reach * np.array([east, north]),
-                  middle + reach * np.array([east, north]), xycoords="axes fraction",
+    east, north = (0.08 * v / max(math.hypot(east, north), 1e-9) for v in (east, north))
+    axes.annotate("", (0.88 - east, 0.88 - north), (0.88 + east, 0.88 + north),
+                  xycoords="axes fraction",
                   textcoords="axes fraction",
                   arrowprops={"arrowstyle": "-|>", "color": "gold", "linewidth": 2.2})
     _finish(figure, axes, f"{site.name}, seed {site.seed}: sun {elevation:.1f} degrees high at "
