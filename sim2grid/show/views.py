@@ -50,7 +50,6 @@ TRACK_M = 0.25  # between the points of a track
 DASH_M = 0.35
 ABOVE_M = 0.05  # of what lies on the ground
 NEAR_M = 4.0  # from a target: what belongs to its solving
-UNLIT = 0.25  # of the light over a piece of ground, below which it is dark
 SHADOWS_M = 45.0  # from the camera: farther ones are not seen
 PLUME = ((0.012, 0.10, (0.95, 0.97, 1.0, 0.55)), (0.032, 0.26, (0.50, 0.66, 1.0, 0.13)))
 """Half width m, half length m and colour of a plume's core and of what is around it."""
@@ -78,7 +77,6 @@ class SceneViews:
         ground = self.take.ground
         self.height = ground_height(ground.heights, ground.spacing)
         self.top = ground_height(self.take.tops, ground.spacing)
-        self.light = None if ground.light is None else ground_height(ground.light, ground.spacing)
         self._tracks = [self._track(i) for i in range(len(self.take.actors))]
         self._targets = [self._target_markers(j) for j in range(len(film.record.targets))]
         self._stands: dict[int, _Stand] = {}
@@ -246,9 +244,7 @@ class SceneViews:
         found = []
         for actor in self.take.actors:
             at = np.nan_to_num(qpos[actor.base:actor.base + 3])
-            # Who stands in the ground's own shadow throws none into it.
-            dark = self.light is not None and self.light(at[:2]) < UNLIT
-            if np.linalg.norm(at - view.eye) < SHADOWS_M and not dark:
+            if np.linalg.norm(at - view.eye) < SHADOWS_M:
                 above = max(0.0, float(at[2] - self.height(at[:2])))
                 found.append(Caster(at, actor.radius, above, actor.body))
         return found

@@ -45,6 +45,12 @@ APRON, APRON_PIECES, APRON_TEXELS = 5, 20, 1024
 SHADE = 0.13
 """Of the light in a film's shadows, what open ground has being 1: light from lit ground around."""
 
+RESPONSE = 0.72
+"""Of a film: how steeply its brightness grows with light."""
+
+IN_SHADOW = round(255.0 * (1.0 - math.exp(-RESPONSE * SHADE)))
+"""Brightness, of 255, of ground in shadow."""
+
 UNLIT = 0.02
 """Of a material's own colour, which a light's share of it cannot be seen; its glow is the rest."""
 
@@ -174,7 +180,7 @@ def bake(site: Site, side: int = BAKED_TEXELS) -> npt.NDArray[np.uint8]:
         albedo += strength * _resized(random.normal(size=(cells, cells)), side)
     light = albedo * (SHADE + (1.0 - SHADE) * lit)
     # A film's response: steep in the dark, saturating in the bright.
-    bright = 255.0 * (1.0 - np.exp(-0.72 * light))
+    bright = 255.0 * (1.0 - np.exp(-RESPONSE * light))
     return (bright[..., None] * np.array([1.0, 0.985, 0.955], np.float32)).astype(np.uint8)
 
 

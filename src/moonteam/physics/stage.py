@@ -119,6 +119,8 @@ class Stage(Canvas):
         self._roots = model.body_rootid[model.geom_bodyid]
         for flag in ("SHADOW", "FOG"):
             self._drawn.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
+        # Under a sun that is asked about much lies in shadow, where nothing throws another.
+        self._darkest = np.uint8(0 if sun is None else look.IN_SHADOW)
         light = look.sunward(look.LOW_SUN, sun)
         aside = np.cross([0.0, 1.0, 0.0] if abs(light[2]) > 0.999 else [0.0, 0.0, 1.0], light)
         aside /= np.linalg.norm(aside)
@@ -233,7 +235,9 @@ class Stage(Canvas):
         rows, columns = np.nonzero(dark)
         part = picture[top:bottom, left:right]
         kept = 1.0 - np.float32(1.0 - 2.0 * look.SHADE) * dark[rows, columns]
-        part[rows, columns] = (part[rows, columns] * kept[:, None]).astype(np.uint8)
+        before = part[rows, columns]
+        part[rows, columns] = np.maximum((before * kept[:, None]).astype(np.uint8),
+                                         np.minimum(before, self._darkest))
 
     def _draw_line(self, line: Line) -> None:
         kind, width = mujoco.mjtGeom.mjGEOM_LINE, line.width
