@@ -33,6 +33,7 @@ from sim2grid.loop import rules as law
 from sim2grid.loop.asked import Asked, Body
 from sim2grid.loop.known import Known
 from sim2grid.loop.logbook import Logbook, cell_of
+from sim2grid.loop.power import Power
 from sim2grid.loop.record import (
     GOING_ON,
     LOSSES,
@@ -92,6 +93,7 @@ class TimedExecution:
         self.finished = False
         self.errands: list[Errand] = []
         self._happenings = Happenings(self)
+        self._power = Power(self.asked, self.record.charges)
         self._due = True
 
     @property
@@ -158,15 +160,17 @@ class TimedExecution:
     def observe(self, qpos: npt.NDArray, power: npt.NDArray, propellant: npt.NDArray,
                 period: float = CONTROL_PERIOD) -> None:
         """Takes what happened since the last look: qpos [T, nq], power, propellant [T, R]."""
-        book, seconds = self.book, period * len(qpos)
+        book, known, seconds = self.book, self.known, period * len(qpos)
         times = book.time + period * np.arange(1, len(qpos) + 1)
         before = self.record.qpos[-1][-1:]
         book.time = float(times[-1])
         self.record.log(times, qpos, power, propellant)
         poses = self._positions(np.concatenate([before, qpos]))  # [T + 1, R, 7]
-        for i, cause in enumerate(self.known.look(poses[1:], seconds).tolist()):
+        for i, cause in enumerate(known.look(poses[1:], seconds).tolist()):
             if cause != law.PRESENT:
                 self.lose(i, LOSSES[cause])
+        for i in self._power.spend(known.mask, poses[-1, :, :2], power, propellant, seconds):
+            self.lose(i, "battery")
         self._progress(poses[0, :, :2], poses[-1, :, :2], seconds)
         self._serve()
         self._happenings.apply()

@@ -567,8 +567,9 @@ def _film(made: Run, best: Optimum | None) -> Film:
     ways = () if made.trace is None else planned_ways(made.trace.cells, prepared.frame)
     return Film(Take(
         prepared.mission, made.execution.record, prepared.frame,
-        Ground(site.heights, site.spacing), made.title, actors_of(prepared), prepared.barred(),
-        ways, optimum.lines(best), f"{site.name} ground, seed {site.seed}"))
+        Ground.of(site), made.title, actors_of(prepared), prepared.barred(),
+        ways, optimum.lines(best),
+        f"{site.name} ground, seed {site.seed}" + words.sunlight(site.sun)))
 
 
 def _plots(film: Film) -> list[tuple[str, str]]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from moonteam.problem.sun import SunPosition
     from sim2grid.measure.metrics import Report
 
 
@@ -17,6 +19,14 @@ def difference(before: Report, now: Report) -> str:
                 return f"{name} differ"
             return f"{name} was {getattr(before, name)}, is {getattr(now, name)}"
     return "nothing"
+
+
+def sunlight(sun: SunPosition | None) -> str:
+    """Where the sun stands, to be added to what is said of the ground."""
+    if sun is None:
+        return ""
+    return (f", sun {math.degrees(sun.elevation):.1f} degrees high at azimuth "
+            f"{math.degrees(sun.azimuth) % 360:.0f}")
 
 
 def show(report: Report, timing: dict[str, float], out: Path, video: Path | None) -> None:
@@ -42,6 +52,13 @@ def show(report: Report, timing: dict[str, float], out: Path, video: Path | None
         print(f"  robot {robot.name:<11} {robot.kind:<8} {robot.moves} moves, {per_move} each, "
               f"{robot.distance_m:.1f} m, tilt to {robot.max_tilt_deg:.0f} deg"
               + (f", LOST: {robot.lost} at {robot.lost_s:.1f} s" if robot.lost else ""))
+        if robot.battery:
+            its = robot.battery
+            print(f"    battery {its.start_wh:.2f} Wh at the start, lowest {its.lowest_wh:.2f}, "
+                  f"{its.end_wh:.2f} at the end; {its.from_sun_wh:.2f} from the sun, "
+                  f"{its.used_wh:.2f} used"
+                  + ("" if its.in_shadow is None else f", {100 * its.in_shadow:.0f} % of the time "
+                     "in shadow"))
     if "real_time_factor" in timing:
         print(f"  {timing['compile_s']:.1f} s to compile, then "
               f"{timing['real_time_factor']:.1f} times real time")

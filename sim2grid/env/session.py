@@ -38,9 +38,14 @@ class Stage:
 
     @classmethod
     def of(cls, mission: Mission, source: object, engine: str) -> Stage:
-        """Raises InputError for a mission that cannot be run by the clock, or no such engine."""
+        """Raises InputError for a mission that cannot be run by the clock, one with batteries, or
+        no such engine.
+        """
         if engine not in ENGINES:
             raise InputError("backend", f"{engine!r} is not allowed; {' or '.join(ENGINES)}")
+        for i in mission.powered():
+            raise InputError(source, "environments count no power; leave it out, or execute the "
+                             "mission by moonteam rollout", f"robots[{i}].battery")
         prepared = prepare(by_the_clock(mission, source), source)
         return cls(prepared, roads_of(prepared), make_backend(engine, prepared.scene))
 

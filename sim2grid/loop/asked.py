@@ -15,6 +15,7 @@ import numpy.typing as npt
 from moonteam.planners.base import IntArray, Planner, Snapshot
 from moonteam.problem.mission import Mission, Target
 from moonteam.problem.scenario import Scenario
+from moonteam.terrain.light import Sunlight
 from sim2grid.frame import Frame
 from sim2grid.loop.replan import with_target
 from sim2grid.loop.rules import Rules
@@ -35,6 +36,7 @@ class Body:
     footprint: float = 0.3  # m, radius
     settle: float = 0.0  # s that setting out and coming to rest cost it
     lands_for: float = float("inf")  # s of service from which it comes down for it
+    light: Sunlight | None = None  # on its ground; None: no sun is asked about
 
 
 class Route(NamedTuple):

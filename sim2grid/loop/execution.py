@@ -34,6 +34,7 @@ from sim2grid.loop.asked import Asked, Body, Mode, Route
 from sim2grid.loop.events import Events
 from sim2grid.loop.known import Known
 from sim2grid.loop.logbook import Logbook, cell_of
+from sim2grid.loop.power import Power
 from sim2grid.loop.record import (
     LOSSES,
     Decision,
@@ -66,6 +67,7 @@ class Execution:
         self.question: Snapshot | None = None
         self.finished = False
         self._events = Events(self.asked)
+        self._power = Power(self.asked, self.record.charges)
         self._free = np.zeros(len(bodies), bool)  # robots that the question is about
         if route is None:
             late = [e.target for e in mission.events if e.target is not None]
@@ -115,7 +117,7 @@ class Execution:
         self.record.log(times, qpos, power, propellant)
         poses = self._positions(np.concatenate([before, qpos]))  # [T + 1, R, 7]
         lost = len(self.record.losses)
-        self._look_for_losses(poses[1:], period * len(qpos))
+        self._look_for_losses(poses[1:], period * len(qpos), power, propellant)
         if self.finished:
             return
         self._look_for_arrivals(poses, period * len(qpos))
@@ -148,11 +150,17 @@ class Execution:
         """Positions and cells [R, 2] by which targets are solved."""
         return self.known.xy, self.snapshot.cells
 
-    def _look_for_losses(self, poses: npt.NDArray, seconds: float) -> None:
-        """Marks robots that fell, left the map or are not a number; poses [T, R, 7]."""
+    def _look_for_losses(self, poses: npt.NDArray, seconds: float, power: npt.NDArray,
+                         propellant: npt.NDArray) -> None:
+        """Marks robots that fell, left the map, are not a number or out of power.
+
+        poses [T, R, 7], power and propellant [T, R].
+        """
         for i, cause in enumerate(self.known.look(poses, seconds).tolist()):
             if cause != law.PRESENT:
                 self._lose(i, LOSSES[cause])
+        for i in self._power.spend(self.known.mask, poses[-1, :, :2], power, propellant, seconds):
+            self._lose(i, "battery")
         if self.book.loss_unnoted:
             self._check_solvable()
 

@@ -13,6 +13,7 @@ from moonteam.planners.base import Snapshot
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.robots import team
+from moonteam.terrain.light import Sunlight
 from moonteam.terrain.site import Site, for_mission
 from moonteam.terrain.traversability import passable_cells
 from sim2grid.frame import Frame
@@ -85,6 +86,7 @@ def prepare(mission: Mission, source: object) -> Prepared:
 
 def bodies_of(scene: Scene) -> tuple[Body, ...]:
     """The robots of a scene as the executor needs to know them."""
+    light = None if scene.site.sun is None else Sunlight(scene.site)
     return tuple(Body(robot.qpos.start, robot.kind.speed, robot.kind.flies, robot.kind.fall_tilt,
-                      robot.kind.footprint, robot.kind.settle, robot.kind.lands_for)
+                      robot.kind.footprint, robot.kind.settle, robot.kind.lands_for, light)
                  for robot in scene.robots)

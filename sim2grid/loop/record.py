@@ -17,9 +17,10 @@ import numpy.typing as npt
 from moonteam.problem.mission import Mission, Target
 from moonteam.problem.scenario import Cell
 from sim2grid.loop import rules
+from sim2grid.loop.power import Charge
 
 Ending = Literal["arrived", "timeout", "lost", "cut"]
-LossCause = Literal["fallen", "stuck", "not_a_number", "off_the_map", "event"]
+LossCause = Literal["fallen", "stuck", "not_a_number", "off_the_map", "battery", "event"]
 ReplanCause = Literal["timeout", "wrong_cell", "robot_lost", "new_target", "slowed", "silent",
                       "heard_again", "impassable", "behind", "appeared", "lapsed"]
 FailureCause = Literal["max_steps", "max_seconds", "unsolvable", "plan_over", "engine",
@@ -111,6 +112,7 @@ class Record:
     qpos: list[npt.NDArray[np.float32]] = field(default_factory=list)  # chunks of [T, nq]
     power: list[npt.NDArray[np.float32]] = field(default_factory=list)  # chunks of [T, R] W
     propellant: list[npt.NDArray[np.float32]] = field(default_factory=list)  # [T, R] kg/s
+    charges: dict[int, Charge] = field(default_factory=dict)  # by robot, of those with a battery
 
     def log(self, times: npt.ArrayLike, qpos: npt.ArrayLike, power: npt.ArrayLike,
             propellant: npt.ArrayLike) -> None:

@@ -80,6 +80,26 @@ class TargetReport(msgspec.Struct, frozen=True):
     expected_s: float | None = None  # by the clock, when the first plan had it solved
 
 
+class BatteryReport(msgspec.Struct, frozen=True):
+    """One robot's power, until the end or until it was lost: start + from_sun - used = end."""
+
+    start_wh: float
+    lowest_wh: float
+    end_wh: float
+    from_sun_wh: float
+    used_wh: float
+    in_shadow: float | None  # share of the time; null where none passed
+
+
+class SoilReport(msgspec.Struct, frozen=True):
+    """What a robot's way on regolith was to take, by what is known of its kind on that soil
+    (`moonteam evaluate paces`) and the slopes along it.
+    """
+
+    expected_slip: float | None  # None: it has no wheels
+    expected_energy_j: float | None  # None: it did not move
+
+
 class RobotReport(msgspec.Struct, frozen=True):
     """One robot. Rates and means are null where there was nothing to measure."""
 
@@ -107,8 +127,18 @@ class RobotReport(msgspec.Struct, frozen=True):
     driving_s: float | None = None  # by the clock: on its ways,
     slower_s: float | None = None  # of which so much more than the ground says,
     service_s: float | None = None  # and in services
-    expected_slip: float | None = None  # on regolith, by what its kind is known to do there
-    expected_energy_j: float | None = None
+    battery: BatteryReport | msgspec.UnsetType = msgspec.UNSET  # not in the file without one
+    soil: SoilReport | msgspec.UnsetType = msgspec.UNSET  # nor on rigid ground
+
+    @property
+    def expected_slip(self) -> float | None:
+        """On regolith, of a robot with wheels."""
+        return None if self.soil is msgspec.UNSET else self.soil.expected_slip
+
+    @property
+    def expected_energy_j(self) -> float | None:
+        """On regolith, of a robot on the ground."""
+        return None if self.soil is msgspec.UNSET else self.soil.expected_energy_j
 
 
 class GridPlan(msgspec.Struct, frozen=True):
@@ -201,19 +231,31 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
         distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
         energy_j=_round(float((track.power[1:] * steps).sum())),
         propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6),
-        **time_spent(record, robot), **on_soil(mission, kind, track, height))
+        battery=battery_report(record, robot), soil=soil_report(mission, kind, track, height),
+        **time_spent(record, robot))
 
 
-def on_soil(mission: Mission, kind: RobotKind | None, track: Track, height: Height | None
-            ) -> dict[str, float | None]:
-    """What was to be expected of a robot's way on the mission's soil; nothing on rigid ground."""
+def soil_report(mission: Mission, kind: RobotKind | None, track: Track, height: Height | None
+                ) -> SoilReport | msgspec.UnsetType:
+    """What was to be expected of a robot's way on the mission's soil; unset on rigid ground."""
     pace = None if kind is None or mission.site.ground == "rigid" else (
         kind.paces.get(mission.site.soil))
     if pace is None or track.qpos is None or height is None:
-        return {}
+        return msgspec.UNSET
     its, energy = expected(pace, track.qpos, height)
-    return {"expected_slip": None if its is None else _round(its),
-            "expected_energy_j": None if energy is None else _round(energy)}
+    return SoilReport(None if its is None else _round(its),
+                      None if energy is None else _round(energy))
+
+
+def battery_report(record: Record, robot: int) -> BatteryReport | msgspec.UnsetType:
+    """One robot's power; unset where it has no battery."""
+    its = record.charges.get(robot)
+    if its is None:
+        return msgspec.UNSET
+    return BatteryReport(
+        start_wh=_round(its.start_wh), lowest_wh=_round(its.lowest_wh), end_wh=_round(its.now_wh),
+        from_sun_wh=_round(its.gained_wh), used_wh=_round(its.used_wh),
+        in_shadow=_round(its.dark_s / its.counted_s) if its.counted_s else None)
 
 
 def time_spent(record: Record, robot: int) -> dict[str, float | None]:

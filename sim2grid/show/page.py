@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from moonteam import files
 from moonteam.problem.skills import held, needed
 from moonteam.report.markup import Raw, cell, data_uri, table
@@ -166,6 +168,7 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
         *(["<h2>Replay in 3-D</h2>", replay] if replay else []),
         "<h2>Video</h2>", video(made, out),
         "<h2>Targets</h2>", _targets(report), "<h2>Robots</h2>", _robots(report),
+        *_power(report),
         *([] if not replans else ["<h2>New plans</h2>", table(
             ["time s", "decision", "cause"], replans)]),
         *[part for title, svg in plots for part in (
@@ -203,6 +206,15 @@ def _robots(report: Report) -> str:
           r.expected_slip, r.timeouts, r.wrong_cells, r.energy_j / 1000, r.propellant_kg * 1000,
           None if r.lost is None else f"{r.lost.replace('_', ' ')} at {r.lost_s:.1f} s")
          for i, r in enumerate(report.robots)])
+
+
+def _power(report: Report) -> list[str]:
+    """The batteries of the robots that have one; nothing where nobody has."""
+    rows = [[name_of_robot(i, r.name), *msgspec.structs.astuple(r.battery)]
+            for i, r in enumerate(report.robots) if r.battery]
+    return ["<h2>Power</h2>", known(
+        ["robot", "Wh at the start", "lowest", "at the end", "from the sun", "used",
+         "share of the time in shadow"], rows)] if rows else []
 
 
 def write(path: str | os.PathLike[str], text: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +21,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from moonteam.problem.mission import Target
 from moonteam.problem.skills import needed
+from moonteam.problem.sun import SunPosition
 from sim2grid.frame import Frame
 
 if TYPE_CHECKING:
     from moonteam.robots.base import Glyph
+    from moonteam.terrain.site import Site
 
 Color = tuple[int, int, int]
 
@@ -39,6 +42,11 @@ STATES: dict[str, Color] = {
 ROBOTS: tuple[Color, ...] = (
     (64, 196, 255), (255, 214, 64), (236, 120, 255), (120, 255, 214),
     (255, 160, 90), (150, 160, 255), (190, 255, 100), (255, 130, 170))
+
+DARK = 0.4
+"""Brightness of ground in shadow, that of the same ground in light being 1; ground over which a
+robot's panel alone has light is halfway.
+"""
 
 SMOOTH = 2
 """Drawn this many times larger, then reduced: smooth edges."""
@@ -61,23 +69,43 @@ def requirement(target: Target) -> str:
     return needed(target.words(), target.either)
 
 
-def hillshade(heights: npt.NDArray, spacing: float) -> npt.NDArray[np.uint8]:
-    """Brightness [ny, nx] of ground [ny, nx] m lit from the north-west, row 0 in the south."""
-    north, east = np.gradient(heights.astype(float), spacing)
-    light = np.array([-1.0, 1.0, 1.2]) / np.linalg.norm([-1.0, 1.0, 1.2])
-    up = 1.0 / np.sqrt(1.0 + east**2 + north**2)
-    shade = (-east * light[0] - north * light[1] + light[2]) * up
-    relief = (heights - heights.min()) / max(float(np.ptp(heights)), 1e-6)
-    contrast = (shade - light[2]) / max(float(shade.std()), 0.05)  # level ground: none
-    return np.clip(100 + 22 * contrast + 30 * (relief - 0.5), 15, 200).astype(np.uint8)
-
-
 @dataclass(frozen=True)
 class Ground:
     """Elevations [ny, nx] m about the origin, row 0 in the south, `spacing` m apart."""
 
     heights: npt.NDArray
     spacing: float
+    sun: SunPosition | None = None
+    light: npt.NDArray | None = None  # [ny, nx] 1 lit by it, 0.5 for a robot's panel alone, else 0
+
+    @classmethod
+    def of(cls, site: Site) -> Ground:
+        """That of a site, and the light on it where it has a sun."""
+        if site.sun is None:
+            return cls(site.heights, site.spacing)
+        from moonteam.terrain.light import PANEL, lit
+
+        light = (lit(site, site.sun) + 1.0 * lit(site, site.sun, PANEL)) / 2
+        return cls(site.heights, site.spacing, site.sun, light)
+
+
+def hillshade(ground: Ground) -> npt.NDArray[np.uint8]:
+    """Brightness [ny, nx] of ground lit from the north-west, or from where its sun stands, with
+    what is in shadow darkened; row 0 in the south.
+    """
+    heights, sun = ground.heights, ground.sun
+    north, east = np.gradient(heights.astype(float), ground.spacing)
+    flat = (-1.0, 1.0) if sun is None else (2**0.5 * math.sin(sun.azimuth),
+                                            2**0.5 * math.cos(sun.azimuth))
+    light = np.array([*flat, 1.2]) / np.linalg.norm([*flat, 1.2])
+    up = 1.0 / np.sqrt(1.0 + east**2 + north**2)
+    shade = (-east * light[0] - north * light[1] + light[2]) * up
+    relief = (heights - heights.min()) / max(float(np.ptp(heights)), 1e-6)
+    contrast = (shade - light[2]) / max(float(shade.std()), 0.05)  # level ground: none
+    bright = np.clip(100 + 22 * contrast + 30 * (relief - 0.5), 15, 200)
+    if ground.light is not None:
+        bright = bright * (DARK + (1.0 - DARK) * ground.light)
+    return bright.astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -147,7 +175,7 @@ class MapPicture:
         return np.stack([at[..., 0], self.height - at[..., 1]], axis=-1)
 
     def _draw_base(self, ground: Ground, barred: npt.NDArray[np.bool_] | None) -> Image.Image:
-        shade = hillshade(ground.heights, ground.spacing)
+        shade = hillshade(ground)
         ny, nx = shade.shape
         half = np.array(self.frame.size) * self.frame.cell_m / 2
         middle = np.array([nx - 1, ny - 1]) / 2

@@ -131,7 +131,7 @@ def paths(story: Story, ground: Ground, barred: npt.NDArray[np.bool_] | None = N
 def _ground(axis: Axes, ground: Ground, half: npt.NDArray) -> None:
     """Hill shade under a map of `half` widths [2] m, with axes in metres."""
     reach = (np.array(ground.heights.shape[::-1]) - 1) * ground.spacing / 2
-    axis.imshow(hillshade(ground.heights, ground.spacing), cmap="gray", vmin=0, vmax=255,
+    axis.imshow(hillshade(ground), cmap="gray", vmin=0, vmax=255,
                 origin="lower", extent=(-reach[0], reach[0], -reach[1], reach[1]))
     axis.set_xlim(-half[0], half[0])
     axis.set_ylim(-half[1], half[1])

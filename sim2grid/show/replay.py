@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 import struct
 import zlib
 from typing import Any
@@ -47,6 +48,8 @@ RATE = 25.0
 GROUND_SIDE = 401
 MOST_FACES = 4000
 MOST_BOULDERS = 1500
+LOWEST = math.radians(10.0)
+"""A sun that is lower is drawn as high as this: its light on the ground would be too faint."""
 SLIP_EVERY, SLIP_WINDOW = 0.5, 4.0
 """s between two figures of slip, and the s of motion that each is taken over."""
 
@@ -132,7 +135,8 @@ def mission_data(story: Story, prepared: Prepared, rate: float) -> str:
     half = [n * frame.cell_m / 2 for n in frame.size]
     head = {
         "seconds": story.record.seconds(), "half": half, "cell": frame.cell_m,
-        "sun": [look.SUN_AZIMUTH, look.SUN_ELEVATION],
+        "sun": [look.bearing(site.sun), look.SUN_ELEVATION if site.sun is None
+                else max(site.sun.elevation, LOWEST)],
         "colours": {"open": hexed(OPEN), "solved": hexed(SOLVED), "replan": hexed(REPLAN),
                     "serving": hexed(STATES["late"])},
         "ground": _ground(site, prepared.barred(), half, frame.cell_m, block),

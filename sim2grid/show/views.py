@@ -19,6 +19,7 @@ from PIL import Image
 from moonteam.physics import look
 from moonteam.physics.render import Marker, framing, turn_z_to
 from moonteam.physics.stage import FAR, Caster, Line, Stage, View
+from moonteam.problem.sun import SunPosition
 from sim2grid.measure.slip import ground_height
 from sim2grid.show.cut import Shot
 from sim2grid.show.film import CHIP, MARGIN, SIDE, Film, Moment, Seen
@@ -72,7 +73,8 @@ class SceneViews:
     def __init__(self, film: Film):
         self.film, self.take = film, film.take
         assert self.take.model is not None
-        self.stage = Stage(self.take.model, film.width, film.height)
+        self.sun = film.take.ground.sun
+        self.stage = Stage(self.take.model, film.width, film.height, self.sun)
         ground = self.take.ground
         self.height = ground_height(ground.heights, ground.spacing)
         self.top = ground_height(self.take.tops, ground.spacing)
@@ -166,7 +168,7 @@ class SceneViews:
             aim, distance = np.array(camera.lookat), max(float(camera.distance), 2.6)
             below = max(self._clear(aim, azimuth + turn, CLOSE_BELOW, distance)
                         for turn in (-DRIFT / 2, DRIFT / 2))
-            cost = (below - CLOSE_BELOW) + 0.35 * _off_sun(azimuth)
+            cost = (below - CLOSE_BELOW) + 0.35 * _off_sun(azimuth, self.sun)
             if best is None or cost < best[0]:
                 best = cost, _Stand(azimuth, below, aim, distance)
         assert best is not None
@@ -188,7 +190,7 @@ class SceneViews:
         for off in (-145.0, -120.0, -60.0, -40.0, 40.0, 60.0, 120.0, 145.0):
             below = max(self._clear(aim, heading + off + d, CHASE_BELOW, distance)
                         for aim in aims for d in (-DRIFT / 2, DRIFT / 2))
-            cost = (below - CHASE_BELOW) + 0.35 * _off_sun(heading + off)
+            cost = (below - CHASE_BELOW) + 0.35 * _off_sun(heading + off, self.sun)
             if best is None or cost < best[0]:
                 best = cost, _Stand(heading + off, below, None, distance)
         assert best is not None
@@ -395,7 +397,7 @@ class SceneViews:
         x, y = (round(float(v) - size / 2) for v in pixel)
         if ahead <= 0 or not (0 <= x < film.width - size and 0 <= y < film.height - size):
             return picture
-        sun = look.sunward(look.LOW_SUN)
+        sun = look.sunward(look.LOW_SUN, self.sun)
         right, up, forward = view.axes
         globe = earth(size, (round(float(sun @ right), 2), round(float(sun @ up), 2),
                              round(float(-sun @ forward), 2)))
@@ -412,9 +414,9 @@ def rgba(color: Color, alpha: float = 1.0) -> Rgba:
     return red, green, blue, alpha
 
 
-def _off_sun(azimuth: float) -> float:
+def _off_sun(azimuth: float, sun: SunPosition | None) -> float:
     """Degrees by which a picture that looks to `azimuth` misses the best light."""
-    sunlight = math.degrees(look.SUN_AZIMUTH) + 180.0
+    sunlight = math.degrees(look.bearing(sun)) + 180.0
     return abs(abs((azimuth - sunlight + 180.0) % 360.0 - 180.0) - BACKLIGHT)
 
 

@@ -426,6 +426,7 @@ def on_grid(fleet: Fleet, make: Callable[[], Planner], events: bool, seeds: Mapp
     for k, seed in seeds.items():
         mission = fleet.missions[k]
         spec = mission if events else msgspec.structs.replace(mission, events=())
+        spec = spec.unpowered()  # nothing is driven, so nothing is used up
         executions.append(Execution(spec, fleet.scenarios[k], make(), bodies, fleet.frame,
                                     seed=seed, rules=rules))
     starts = np.stack([ideal_start(fleet.frame, [r.cell for r in fleet.missions[k].robots])

@@ -32,6 +32,7 @@ from sim2grid.show.picture import (
     NIGHT,
     OPEN,
     SOLVED,
+    Ground,
     hillshade,
     requirement,
     robot_color,
@@ -150,7 +151,7 @@ def _ground(mission: Mission, name: str) -> str:
         site = for_mission(mission)
     except InputError:
         return f'<g id="{name}">{inside}</g>'
-    shade = hillshade(site.heights, site.spacing)
+    shade = hillshade(Ground.of(site))
     half = np.array(mission.map.size) * mission.map.cell_m / 2 / site.spacing
     middle = (np.array(shade.shape[::-1]) - 1) / 2
     (left, low), (right, top) = np.rint(middle - half), np.rint(middle + half) + 1

@@ -290,3 +290,36 @@ def test_what_is_no_report_is_refused(tmp_path, capsys, text, named):
     file.write_text(text)
     assert main(["rollout", "--from", str(file), "--mission", "0"]) == 2
     assert named in capsys.readouterr().err
+
+
+SUNNY = """
+name: sunny
+map: {size: [4, 4]}
+site: {preset: polar, seed: 13}
+sun: {azimuth: 45, elevation: 4, dark: 3}
+clock: seconds
+robots:
+  - {name: roll, kind: wheeled, skills: [A], start: [0, 0],
+     battery: {capacity_wh: 1, panel_w: 0, idle_w: 36}}
+targets:
+  - {at: [2, 1], skills: [A]}
+"""
+
+
+def test_a_robots_power_is_told(tmp_path, capsys):
+    file, out = tmp_path / "sunny.yaml", tmp_path / "out"
+    file.write_text(SUNNY)
+    assert rollout(file, out) == 0
+    assert "battery 1.00 Wh at the start" in capsys.readouterr().out
+    report = json.loads((out / "report.json").read_text())
+    battery = report["robots"][0]["battery"]
+    hours = report["seconds"] / 3600
+    moved = report["robots"][0]["energy_j"] / 0.7 / 3600
+    assert battery["used_wh"] == pytest.approx(36 * hours + moved, abs=2e-4)
+    assert battery["end_wh"] == pytest.approx(1 - battery["used_wh"], abs=2e-4)
+    assert moved > 0
+    assert "<h2>Power</h2>" in (out / "report.html").read_text()
+    file.write_text(SUNNY.replace("capacity_wh: 1", "capacity_wh: 0.02"))
+    assert rollout(file, tmp_path / "dark") == 1
+    assert "LOST: battery at 1." in (told := capsys.readouterr().out)
+    assert "roll (battery)" in told

@@ -51,7 +51,23 @@ def test_travel_is_told_and_drawn(tmp_path, capsys):
     assert "from -6, 5 m: " in capsys.readouterr().out
 
 
+def test_light_and_shadow_are_told_and_drawn(tmp_path, capsys):
+    words = ["site", "--preset", "polar", "--seed", "13", "--size", "24"]
+    assert main([*words, "--sun", "45", "4", "--json", "--out", str(tmp_path)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["files"][-1] == str(tmp_path / "light.png")
+    assert (tmp_path / "light.png").read_bytes().startswith(b"\x89PNG")
+    light = report["light"]
+    assert (light["azimuth_deg"], light["elevation_deg"]) == (45.0, 4.0)
+    assert 0.05 < light["lit"] < light["panels_lit"] < 0.95
+    assert main([*words, "--sun-at", "-89.5", "12", "2027-03-20T12:00"]) == 0
+    assert "degrees high at azimuth" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("words", "told"), [
+    (["--sun", "45", "99"], "--sun: elevation 99 is not allowed"),
+    (["--sun-at", "-89", "0", "soon"], "--sun-at: time 'soon' is not allowed"),
+    (["--sun", "45", "9", "--sun-at", "0", "0", "2027-03-20"], "not both"),
     (["--travel", "mule"], "mule"), (["--travel", "drone", "--to", "90", "0"], "off the map"),
     (["--travel", "drone", "--start", "0", "-90"], "off the map"),
     (["--size", "1"], "4 to 1000"), (["--seed", "-1"], "--seed"), (["--cell", "0"], "--cell"),

@@ -1,11 +1,14 @@
 """Pictures with depth of a painted scene: shadows where the sun is kept off, smooth edges."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from moonteam.physics import look, stage
 from moonteam.physics.render import RenderingUnavailable
 from moonteam.physics.scene import Placement, build_scene
+from moonteam.problem.sun import SunPosition
 from moonteam.terrain.site import Boulder, Site, make_site
 
 
@@ -82,3 +85,34 @@ def test_a_staircase_becomes_a_slope_and_flat_parts_stay():
     off, before = (np.abs(values.astype(float) - even)[10:54, 10:86].sum()
                    for values in (inner, steps))
     assert off < 0.8 * before
+
+
+def test_a_sites_own_sun_is_baked_into_its_ground():
+    """From the north, then from the south; and in the dark as if it stood a little up."""
+    y = np.mgrid[-40:41, -40:41][0] * 0.25
+    ridge = np.exp(-(y / 0.5) ** 2).astype(np.float32)
+    bright = {}
+    for azimuth in (0.0, np.pi):
+        site = Site("ridge", 1, ridge, 0.25, sun=SunPosition(azimuth, np.radians(8)))
+        light = look.bake(site, 256).astype(float).mean(axis=2)
+        bright[azimuth] = light[150:165].mean(), light[91:106].mean()  # north and south of it
+    assert bright[0.0][0] > 2 * bright[0.0][1]
+    assert bright[np.pi][1] > 2 * bright[np.pi][0]
+    low = SunPosition(0.3, -0.2)
+    np.testing.assert_allclose(look.sunward(sun=low), SunPosition(0.3, look.LOWEST_SUN).toward)
+
+
+def test_a_sites_own_sun_throws_the_shadows_of_what_moves(scene, drawing):
+    del drawing  # where nothing can be drawn, this is skipped
+    lit = dataclasses.replace(scene, site=dataclasses.replace(
+        scene.site, sun=SunPosition(np.radians(90), np.radians(10))))
+    model = stage.painted(lit)
+    np.testing.assert_allclose(model.light("sun").dir, -look.sunward(sun=lit.site.sun), atol=1e-6)
+    centre = scene.qpos0[:3]
+    with stage.Stage(model, 320, 240, lit.site.sun) as made:
+        plain, _ = made.frame(scene.qpos0, VIEW)
+        cast, _ = made.frame(scene.qpos0, VIEW, casters=[stage.Caster(centre, 0.6, centre[2])])
+    darker = plain.astype(int).sum(axis=2) - cast.astype(int).sum(axis=2) > 40
+    (west, east), _ = VIEW.project(np.array([[-0.9, 0.0, 0.0], [0.9, 0.0, 0.0]]), (320, 240))
+    assert darker[int(west[1]), int(west[0])]
+    assert not darker[int(east[1]), int(east[0])]

@@ -115,14 +115,14 @@ def make_mission(robots, targets, size=(4, 4), cell_m=1.0, **more) -> missions.M
 
 
 def run_on_points(spec, planner, *, faults=None, passable=None, speed=0.5, traps=(),
-                  **options) -> Execution:
+                  light=None, **options) -> Execution:
     """Runs a mission on sliding points to its end."""
     height, width = spec.map.size[1], spec.map.size[0]
     free = {r.kind: np.ones((height, width), bool) for r in spec.robots} | (passable or {})
     frame = Frame(spec.map.size, spec.map.cell_m)
     backend = SlidingPoints(frame.centre(np.array([r.start for r in spec.robots], float)),
                             faults or {}, list(traps))
-    bodies = [Body(base=7 * i, speed=speed, flies=r.kind == "drone")
+    bodies = [Body(base=7 * i, speed=speed, flies=r.kind == "drone", light=light)
               for i, r in enumerate(spec.robots)]
     execution = Execution(spec, grid_problem(spec, free), planner, bodies, frame, **options)
     run([execution], backend, backend.pose())

@@ -31,6 +31,9 @@ def check(execution: Execution) -> None:
     if asked.mission.events:
         raise InputError("--backend fused", "takes missions without events; the other backends "
                          "take them: native, mjx")
+    if asked.mission.powered():
+        raise InputError("--backend fused", "takes missions without batteries; the other backends "
+                         "take them: native, mjx")
 
 
 def run(executions: Sequence[Execution], backend: MjxBackend, starts: npt.NDArray, width: int,

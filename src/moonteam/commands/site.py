@@ -13,12 +13,13 @@ from moonteam.errors import InputError
 if TYPE_CHECKING:
     import numpy.typing as npt
 
+    from moonteam.problem.sun import SunPosition
     from moonteam.terrain.site import Site
 
     Maps = dict[str, npt.NDArray[Any]]
 
 FILES = ("site.json", "heights.npy", "heights.tif", "maps.npz", "hillshade.png", "slope.png",
-         "roughness.png", "traversability.png", "travel.png")
+         "roughness.png", "traversability.png", "travel.png", "light.png")
 """In --out."""
 
 
@@ -29,7 +30,8 @@ class Args(Elevation, Saved, Printed):
     Writes heights.npy and heights.tif, site.json (measured slopes, roughness, crater counts
     against the law), maps.npz (by kind the cells that are open and the seconds to cross each),
     and pictures: hillshade, slope, roughness, traversability by kind.
-    With --travel also a map of a kind's seconds to a place, with ways to it.
+    With --travel also a map of a kind's seconds to a place, with ways to it; with --sun or
+    --sun-at a map of light and shadow.
 
     Examples:
       moonteam site --preset mare --seed 3 --size 32 --out runs/site
@@ -37,6 +39,8 @@ class Args(Elevation, Saved, Printed):
       moonteam site --dem moon.tif --size 40 --units pixels --centre 512 300 --rotation 30
       moonteam site --dem heights.npy --pixel 1.0 --json
       moonteam site --preset highland --travel KIND --to 5 -3 --out runs/travel
+      moonteam site --preset polar --size 48 --sun 135 4 --out runs/light
+      moonteam site --preset polar --sun-at -89.5 12 2027-03-20T12:00
     """
 
     preset: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
@@ -64,6 +68,13 @@ class Args(Elevation, Saved, Printed):
     start: tuple[float, float] | None = None
     """where the way of --travel begins; if not given, ways from about the four corners"""
 
+    sun: tuple[float, float] | None = None
+    """azimuth from north clockwise and elevation of the sun, degrees: which ground it lights
+    (light.png in --out)"""
+
+    sun_at: tuple[float, float, str] | None = None
+    """the same for the sun over a latitude and longitude, degrees selenographic, at a time, UTC"""
+
 
 def run(args: Args) -> int:
     """Makes, measures and draws; always 0, bad input raises InputError."""
@@ -77,16 +88,22 @@ def run(args: Args) -> int:
         from moonteam.robots import KINDS
 
         KINDS.get(args.travel)  # before anything is made
+    sun = _sun(args)
     site = _site(args)
     seconds = _seconds(site, args.cell)
     report = measure(site) | _summary(seconds)
     travel = None if args.travel is None else _travel(site, args, args.travel)
     if travel is not None:
         report["travel"] = travel.document
+    light = None if sun is None else _light(site, sun)
+    if light is not None:
+        report["light"] = light.document
     if args.out is not None:
         report["files"] = _write(site, args.out, args.cell, seconds)
         if travel is not None:
             report["files"].append(str(travel.draw(args.out / "travel.png")))
+        if light is not None:
+            report["files"].append(str(light.draw(args.out / "light.png")))
         files.write_json(args.out / "site.json", report)
     if args.json:
         print(files.dump_json(report))
@@ -103,6 +120,55 @@ def _travel(site: Site, args: Args, kind: str) -> Any:
 
     size = grid_of(site, args.cell)
     return show(site, size, args.cell, kind, KINDS.get(kind).limits, args.to, args.start)
+
+
+def _sun(args: Args) -> SunPosition | None:
+    """What --sun or --sun-at asks for. Raises InputError."""
+    from moonteam.problem.sun import Sun
+
+    if args.sun is not None and args.sun_at is not None:
+        raise InputError("--sun", "give it or --sun-at, not both")
+    if args.sun is not None:
+        asked, option = Sun(azimuth=args.sun[0], elevation=args.sun[1]), "--sun"
+    elif args.sun_at is not None:
+        latitude, longitude, time = args.sun_at
+        asked, option = Sun(latitude=latitude, longitude=longitude, time=time), "--sun-at"
+    else:
+        return None
+    asked.check(lambda key, problem: InputError(option, f"{key} {problem}".strip()))
+    return asked.position()
+
+
+@dataclass(frozen=True)
+class _Light:
+    """The light on a site: what the report says of it, and its picture."""
+
+    site: Site
+    sun: SunPosition
+    lit: npt.NDArray[Any]  # [ny, nx] of the ground
+    panels: npt.NDArray[Any]  # [ny, nx] of robots' panels over it
+
+    @property
+    def document(self) -> dict[str, float]:
+        """Where the sun stands, degrees, and the shares of ground and of panels in its light."""
+        import numpy as np
+
+        return {"azimuth_deg": round(float(np.degrees(self.sun.azimuth)) % 360, 3),
+                "elevation_deg": round(float(np.degrees(self.sun.elevation)), 3),
+                "lit": round(float(self.lit.mean()), 4),
+                "panels_lit": round(float(self.panels.mean()), 4)}
+
+    def draw(self, path: Path) -> Path:
+        """The picture."""
+        from moonteam.terrain.preview import draw_light
+
+        return draw_light(self.site, path, self.sun, self.lit, self.panels)
+
+
+def _light(site: Site, sun: SunPosition) -> _Light:
+    from moonteam.terrain.light import PANEL, lit
+
+    return _Light(site, sun, lit(site, sun), lit(site, sun, PANEL))
 
 
 def _site(args: Args) -> Site:
@@ -192,5 +258,10 @@ def _show(report: dict[str, Any]) -> None:
             (x, y), corners = way["points"][0], len(way["points"]) - 2
             print(f"    from {x:g}, {y:g} m: {way['seconds']:.1f} s over {way['metres']:.1f} m, "
                   f"{corners} corner{'' if corners == 1 else 's'}")
+    if "light" in report:
+        its = report["light"]
+        print(f"  sun {its['elevation_deg']:.2f} degrees high at azimuth {its['azimuth_deg']:.1f}: "
+              f"{100 * its['lit']:.1f} % of the ground is lit, {100 * its['panels_lit']:.1f} % for "
+              "a robot's panel")
     for name in report.get("files", []):
         print(f"  {name}")

@@ -11,12 +11,18 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from moonteam.problem.sun import SunPosition
 from moonteam.terrain.site import Site
 
 Floats = npt.NDArray[np.float32]
 
 SUN_AZIMUTH, SUN_ELEVATION = math.radians(215.0), math.radians(28.0)
-"""Where the sunlight comes from; low, so that relief shows."""
+"""Where the sunlight comes from unless the site has a sun of its own; low, so that relief shows.
+The azimuth is from east counterclockwise.
+"""
+
+LOWEST_SUN = math.radians(2.0)
+"""No picture has the sun lower: a site in the dark is shown as if it stood there."""
 
 SUN_DISTANCE = 30.0
 """From where a picture looks to the sun's place in it, m; its light is parallel."""
@@ -39,6 +45,12 @@ APRON, APRON_PIECES, APRON_TEXELS = 5, 20, 1024
 SHADE = 0.13
 """Of the light in a film's shadows, what open ground has being 1: light from lit ground around."""
 
+RESPONSE = 0.72
+"""Of a film: how steeply its brightness grows with light."""
+
+IN_SHADOW = round(255.0 * (1.0 - math.exp(-RESPONSE * SHADE)))
+"""Brightness, of 255, of ground in shadow."""
+
 UNLIT = 0.02
 """Of a material's own colour, which a light's share of it cannot be seen; its glow is the rest."""
 
@@ -47,7 +59,7 @@ VISUAL_GROUP = 1
 
 def decorate(spec: mujoco.MjSpec, site: Site) -> None:
     """Adds light, sky, ground texture and rocks to a scene's spec."""
-    _light(spec)
+    _light(spec, site.sun)
     _sky(spec)
     _regolith(spec, site)
     for index, boulder in enumerate(site.boulders):
@@ -74,7 +86,7 @@ def paint(spec: mujoco.MjSpec, site: Site) -> None:
     ground.rgba, ground.emission = [UNLIT, UNLIT, UNLIT, 1.0], 1.0 / UNLIT
     _apron(spec, site)
     sun = spec.light("sun")
-    sun.dir, sun.castshadow = -sunward(LOW_SUN), False
+    sun.dir, sun.castshadow = -sunward(LOW_SUN, site.sun), False
     sky = spec.texture("sky")
     sky.width, sky.height, sky.random = STAR_TEXELS, 6 * STAR_TEXELS, 0.0004
     spec.visual.headlight.ambient = [0.20, 0.20, 0.22]
@@ -90,7 +102,8 @@ def _apron(spec: mujoco.MjSpec, site: Site) -> None:
     half = site.extent
     rows, columns = heights.shape
     pixels = bake(Site("apron", site.seed + 1, heights,
-                       2 * APRON * float(np.mean(half)) / (columns - 1)), APRON_TEXELS)
+                       2 * APRON * float(np.mean(half)) / (columns - 1), sun=site.sun),
+                  APRON_TEXELS)
     texture = spec.add_texture(name="apron", type=mujoco.mjtTexture.mjTEXTURE_2D,
                                width=APRON_TEXELS, height=APRON_TEXELS, nchannel=3)
     texture.data = pixels[::-1].tobytes()
@@ -125,14 +138,27 @@ def _around(site: Site) -> tuple[Floats, npt.NDArray[np.bool_]]:
     return heights.astype(np.float32), away < -1e-6
 
 
-def sunward(elevation: float = SUN_ELEVATION) -> npt.NDArray[np.float64]:
-    """Unit vector [3] to the sun."""
+def shown(sun: SunPosition) -> SunPosition:
+    """The sun as pictures have it: no lower than LOWEST_SUN."""
+    return sun._replace(elevation=max(sun.elevation, LOWEST_SUN))
+
+
+def bearing(sun: SunPosition | None) -> float:
+    """Where the light of a picture comes from, rad from east counterclockwise."""
+    return SUN_AZIMUTH if sun is None else math.pi / 2 - sun.azimuth
+
+
+def sunward(elevation: float = SUN_ELEVATION, sun: SunPosition | None = None
+            ) -> npt.NDArray[np.float64]:
+    """Unit vector [3] to the sun of a picture: a site's own, else at that elevation, rad."""
+    if sun is not None:
+        return np.array(shown(sun).toward)
     return np.array([math.cos(elevation) * math.cos(SUN_AZIMUTH),
                      math.cos(elevation) * math.sin(SUN_AZIMUTH), math.sin(elevation)])
 
 
 def bake(site: Site, side: int = BAKED_TEXELS) -> npt.NDArray[np.uint8]:
-    """The ground under a low sun [side, side, 3], row 0 in the south.
+    """The ground under a low sun, or the site's own [side, side, 3], row 0 in the south.
 
     Relief comes from the elevations; grain and pits finer than their spacing are paint, nobody
     drives over them.
@@ -145,7 +171,7 @@ def bake(site: Site, side: int = BAKED_TEXELS) -> npt.NDArray[np.uint8]:
         _grain(random, side, float(texel.mean())), texel[1], texel[0]), np.float32)
     slope_x = _resized(east, side) + grain_east
     slope_y = _resized(north, side) + grain_north
-    sun = sunward(LOW_SUN).astype(np.float32)
+    sun = sunward(LOW_SUN, site.sun).astype(np.float32)
     facing = (sun[2] - slope_x * sun[0] - slope_y * sun[1]) / np.sqrt(
         1.0 + slope_x**2 + slope_y**2)
     lit = np.clip(facing / sun[2], 0.0, 3.2) * (1.0 - _shadowed(site, side))
@@ -154,7 +180,7 @@ def bake(site: Site, side: int = BAKED_TEXELS) -> npt.NDArray[np.uint8]:
         albedo += strength * _resized(random.normal(size=(cells, cells)), side)
     light = albedo * (SHADE + (1.0 - SHADE) * lit)
     # A film's response: steep in the dark, saturating in the bright.
-    bright = 255.0 * (1.0 - np.exp(-0.72 * light))
+    bright = 255.0 * (1.0 - np.exp(-RESPONSE * light))
     return (bright[..., None] * np.array([1.0, 0.985, 0.955], np.float32)).astype(np.uint8)
 
 
@@ -183,7 +209,7 @@ def _grain(random: np.random.Generator, side: int, texel: float) -> Floats:
 
 def _shadowed(site: Site, side: int) -> Floats:
     """0 to 1 [side, side]: ground and rocks between the ground and the sun."""
-    sun = sunward(LOW_SUN)
+    sun = sunward(LOW_SUN, site.sun)
     climb = sun[2] / math.hypot(sun[0], sun[1])
     heights = site.heights.astype(np.float32)
     ny, nx = heights.shape
@@ -242,10 +268,8 @@ def mesh_offsets(model: mujoco.MjModel, site: Site) -> None:
         model.geom_quat[geom] = model.mesh_quat[mesh]
 
 
-def _light(spec: mujoco.MjSpec) -> None:
-    direction = -np.array([
-        math.cos(SUN_ELEVATION) * math.cos(SUN_AZIMUTH),
-        math.cos(SUN_ELEVATION) * math.sin(SUN_AZIMUTH), math.sin(SUN_ELEVATION)])
+def _light(spec: mujoco.MjSpec, sun: SunPosition | None) -> None:
+    direction = -sunward(sun=sun)
     spec.worldbody.add_light(
         name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=direction,
         pos=-SUN_DISTANCE * direction, diffuse=[1.25, 1.23, 1.17], specular=[0.15, 0.15, 0.15],

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from moonteam.physics import look
 from moonteam.physics.render import SHOWN_GROUPS, Canvas, Color, Marker, open_window
 from moonteam.physics.scene import Scene, set_heights
+from moonteam.problem.sun import SunPosition
 
 MAX_GEOMS = 6000
 NEAR, FAR = 0.15, 1500.0  # m
@@ -104,9 +105,10 @@ class Line:
 
 
 class Stage(Canvas):
-    """Draws a painted model. Raises RenderingUnavailable."""
+    """Draws a painted model under the sun of its site. Raises RenderingUnavailable."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int):
+    def __init__(self, model: mujoco.MjModel, width: int, height: int,
+                 sun: SunPosition | None = None):
         model.vis.global_.offwidth = max(width, SUN_PIXELS)
         model.vis.global_.offheight = max(height, SUN_PIXELS)
         model.vis.quality.offsamples = 0
@@ -117,10 +119,12 @@ class Stage(Canvas):
         self._roots = model.body_rootid[model.geom_bodyid]
         for flag in ("SHADOW", "FOG"):
             self._drawn.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
-        sun = look.sunward(look.LOW_SUN)
-        aside = np.cross([0.0, 0.0, 1.0], sun)
+        # Under a sun that is asked about much lies in shadow, where nothing throws another.
+        self._darkest = np.uint8(0 if sun is None else look.IN_SHADOW)
+        light = look.sunward(look.LOW_SUN, sun)
+        aside = np.cross([0.0, 1.0, 0.0] if abs(light[2]) > 0.999 else [0.0, 0.0, 1.0], light)
         aside /= np.linalg.norm(aside)
-        self._sun = np.stack([aside, np.cross(sun, aside), sun])  # rows: right, up, to the sun
+        self._sun = np.stack([aside, np.cross(light, aside), light])  # rows: right, up, to the sun
 
     def frame(self, qpos: Floats, view: View, markers: Sequence[Marker] = (),
               lines: Sequence[Line] = (), casters: Sequence[Caster] = ()
@@ -231,7 +235,9 @@ class Stage(Canvas):
         rows, columns = np.nonzero(dark)
         part = picture[top:bottom, left:right]
         kept = 1.0 - np.float32(1.0 - 2.0 * look.SHADE) * dark[rows, columns]
-        part[rows, columns] = (part[rows, columns] * kept[:, None]).astype(np.uint8)
+        before = part[rows, columns]
+        part[rows, columns] = np.maximum((before * kept[:, None]).astype(np.uint8),
+                                         np.minimum(before, self._darkest))
 
     def _draw_line(self, line: Line) -> None:
         kind, width = mujoco.mjtGeom.mjGEOM_LINE, line.width

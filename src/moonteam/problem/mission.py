@@ -15,8 +15,10 @@ import msgspec
 from moonteam import files
 from moonteam.errors import InputError, meant
 from moonteam.problem import scenario, timed
+from moonteam.problem.battery import Battery
 from moonteam.problem.piece import Piece, Units
 from moonteam.problem.scenario import MOST_AGENTS, MOST_STEPS, MOST_TARGETS, Cell, Name, Skills
+from moonteam.problem.sun import Sun
 from moonteam.strict import yaml_value
 
 WHAT = ("lost", "target", "slow", "silent", "impassable")
@@ -83,6 +85,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     """One robot of a kind (a registered name, or FILE.py:OBJECT), with skills and start.
 
     By the clock it may be slower than its kind (`speed`, m/s) and have a `home` to be back at.
+    With a `battery` it is lost when that is empty.
     """
 
     name: Name
@@ -91,6 +94,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     start: Place
     speed: float | None = None
     home: Place | None = None
+    battery: Battery | None = None
 
     @property
     def cell(self) -> Cell:
@@ -182,7 +186,7 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     `clock`: in steps a decision is one cell, as the paper has it, and the mission has failed after
     `max_steps` of them. In seconds a decision is a target, held until something happens, and the
-    mission has failed after `max_seconds`.
+    mission has failed after `max_seconds`. `sun`: without one, light is not asked about.
     """
 
     map: Map
@@ -194,6 +198,16 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     events: Annotated[tuple[Event, ...], msgspec.Meta(max_length=MOST_EVENTS)] = ()
     clock: Literal["steps", "seconds"] = "steps"
     max_seconds: float = 900.0
+    sun: Sun | None = None
+
+    def powered(self) -> list[int]:
+        """Numbers of the robots that have a battery."""
+        return [i for i, robot in enumerate(self.robots) if robot.battery is not None]
+
+    def unpowered(self) -> Mission:
+        """The same mission, nobody's power counted."""
+        robots = tuple(msgspec.structs.replace(robot, battery=None) for robot in self.robots)
+        return msgspec.structs.replace(self, robots=robots) if self.powered() else self
 
     def target_name(self, index: int) -> str:
         """The target's own name, else T1, T2, ..."""
@@ -234,6 +248,7 @@ def check(mission: Mission, source: object) -> Mission:
         raise InputError(source, f"{mission.map.cell_m} is not allowed; 0.25 to 100 metres",
                          "map.cell_m")
     _check_site(mission.site, source)
+    _check_power(mission, source)
     _check_names(mission, source)
     if not mission.robots:
         raise InputError(source, "at least one robot is needed", "robots")
@@ -343,6 +358,20 @@ def _check_site(site: Site, source: object) -> None:
         raise InputError(source, f"{site.band} is not allowed; at least 0", "site.band")
     if not 0 <= site.seed <= MOST_SEED:
         raise InputError(source, f"{site.seed} is not allowed; 0 to {MOST_SEED}", "site.seed")
+
+
+def _check_power(mission: Mission, source: object) -> None:
+    """The sun and batteries. Raises InputError."""
+    if mission.sun is not None:
+        mission.sun.check(lambda key, problem: InputError(
+            source, problem, f"sun.{key}" if key else "sun"))
+    for i in mission.powered():
+        battery, at = mission.robots[i].battery, f"robots[{i}].battery"
+        assert battery is not None
+        battery.check(lambda key, problem, at=at: InputError(source, problem, f"{at}.{key}"))
+        if battery.panel_w and mission.sun is None:
+            raise InputError(source, f"{battery.panel_w:g} is not allowed without a sun; give the "
+                             "mission a key sun too, or 0", f"{at}.panel_w")
 
 
 def _check_names(mission: Mission, source: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from moonteam import files
+from moonteam.problem.sun import SunPosition
 from moonteam.terrain.measure import roughness_map, slope_map
 from moonteam.terrain.site import Site
-from moonteam.terrain.traversability import FloatMap
+from moonteam.terrain.traversability import BoolMap, FloatMap
 
 EDGE = 1.0
 """Ground kept free around the grid, m: no robot can stand on the very edge."""
@@ -138,6 +140,35 @@ def draw_travel(site: Site, path: Path, title: str, half: tuple[float, float], s
         axes.plot(*ways[0][0][-1], "*", color="gold", markersize=15, markeredgecolor="black")
     figure.colorbar(bands, ax=axes, shrink=0.85, label="s to the star")
     _finish(figure, axes, title, path)
+    return path
+
+
+def draw_light(site: Site, path: Path, sun: SunPosition, lit: BoolMap, panels: BoolMap) -> Path:
+    """Which ground the sun lights, and over which a robot's panel has light [ny, nx], on the ground
+    shaded from there; the picture's path. An arrow says where the light goes.
+    """
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    azimuth, elevation = math.degrees(sun.azimuth) % 360, math.degrees(sun.elevation)
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    axes = figure.subplots()
+    place: dict[str, Any] = {"origin": "lower", "extent": box(site)}
+    axes.imshow(hillshade(site, azimuth, 25.0), cmap="gray", vmin=0, vmax=1, **place)
+    axes.contour(site.heights, levels=8, colors="tab:orange", linewidths=0.5, alpha=0.7, **place)
+    for dark, alpha in ((lit, 0.5), (panels, 0.6)):
+        axes.imshow(np.ma.masked_array(np.ones(dark.shape), dark), interpolation="nearest",
+                    alpha=alpha, cmap=ListedColormap(["#0b1230"]), **place)
+    _rocks(axes, site)
+    east, north, _ = sun.toward
+    east, north = (0.08 * v / max(math.hypot(east, north), 1e-9) for v in (east, north))
+    axes.annotate("", (0.88 - east, 0.88 - north), (0.88 + east, 0.88 + north),
+                  xycoords="axes fraction",
+                  textcoords="axes fraction",
+                  arrowprops={"arrowstyle": "-|>", "color": "gold", "linewidth": 2.2})
+    _finish(figure, axes, f"{site.name}, seed {site.seed}: sun {elevation:.1f} degrees high at "
+            f"azimuth {azimuth:.0f}, {100 * lit.mean():.0f} % of the ground lit,\n"
+            f"{100 * panels.mean():.0f} % for a robot's panel (darkest: neither)", path)
     return path
 
 

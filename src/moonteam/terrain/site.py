@@ -22,6 +22,7 @@ import trimesh
 from moonteam.errors import InputError, meant
 from moonteam.problem.mission import Mission
 from moonteam.problem.piece import WHOLE, Piece
+from moonteam.problem.sun import SunPosition
 from moonteam.terrain import dem, generate
 from moonteam.terrain import soil as soils
 from moonteam.terrain.soil import Soil
@@ -73,6 +74,7 @@ class Site:
     spacing: float  # m
     boulders: tuple[Boulder, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict)
+    sun: SunPosition | None = None  # None: nobody asks for it, and pictures have their own
     soil: Soil | None = None  # what the ground is made of; None: it is rigid
     known: bool = True  # whether maps and fields know the soil, or believe that it is rigid
 
@@ -144,20 +146,22 @@ def rough_ground(shape: tuple[int, int], rms: float, seed: int, spacing: float) 
 def for_mission(mission: Mission, spacing: float = SPACING, source: object = None) -> Site:
     """The ground that a mission asks for: its map plus a margin, map centre = site centre.
 
-    An elevation model has to cover the map alone. Raises InputError naming `source`, where one is
-    given, and the key.
+    An elevation model has to cover the map alone. The sun is the mission's. Raises InputError
+    naming `source`, where one is given, and the key.
     """
     try:
-        site = _mission_ground(mission, spacing)
+        site = _ground_for(mission, spacing)
     except InputError as error:
         if source is None:
             raise
         its = mission.site
         raise InputError(source, f"{error.source}: {error.problem}" if its.dem else error.problem,
                          _mission_key(mission, error.key)) from None
-    if mission.site.ground == "rigid":
-        return site
-    return replace(with_soil(site, mission.site.soil), known=mission.site.fields == "measured")
+    if mission.sun is not None:
+        site = replace(site, sun=mission.sun.position())
+    if mission.site.ground == "regolith":
+        site = with_soil(site, mission.site.soil)
+    return replace(site, known=mission.site.fields == "measured")
 
 
 def with_soil(site: Site, soil: str) -> Site:
@@ -170,7 +174,7 @@ def with_soil(site: Site, soil: str) -> Site:
     return replace(site, soil=found, meta=site.meta | {"soil": {"name": found.name} | told})
 
 
-def _mission_ground(mission: Mission, spacing: float) -> Site:
+def _ground_for(mission: Mission, spacing: float) -> Site:
     width, height = (n * mission.map.cell_m for n in mission.map.size)
     its = mission.site
     if its.dem is None:

@@ -291,3 +291,16 @@ def test_the_same_mission_twice_is_the_same(mission, drive):
     runs = [drive(spec, (0, (0, 1)), (1, (2,))) for _ in range(2)]
     assert runs[0].record.success
     assert np.array_equal(*[np.concatenate(one.record.qpos) for one in runs])
+
+
+def test_an_empty_battery_breaks_off_a_service_for_good(mission, drive):
+    battery = {"capacity_wh": 12 * 20 / 3600, "idle_w": 20}
+    spec = mission([ROVER | {"battery": battery}, ROVER | {"name": "other", "start": [0, 8]}],
+                   [{"at": [2, 0], "skills": ["A"], "service": 30}])
+    done = drive(spec, (0, (0,)), spare=(0, (1,)))
+    [loss] = done.record.losses
+    assert (loss.robot, loss.cause) == (0, "battery")
+    assert loss.time_s == pytest.approx(12, abs=2 * LOOK)
+    assert done.record.success
+    assert done.record.solves[0].robots == (1,)
+    assert done.record.solves[0].time_s > 12 + 30

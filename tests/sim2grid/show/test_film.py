@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 
 from moonteam.errors import InputError
+from moonteam.problem.sun import SunPosition
 from moonteam.report import video
+from moonteam.terrain.site import Site, make_site
 from sim2grid.frame import Frame
 from sim2grid.show.film import Film, Seen
 from sim2grid.show.hud import Label, Labels
@@ -159,8 +161,8 @@ def test_skills_with_names_stand_apart(mission):
 
 def test_hillshade_lights_slopes_that_face_north_west():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
-    facing = hillshade(0.3 * (x - y), 1.0)[10, 10]
-    averted = hillshade(0.3 * (y - x), 1.0)[10, 10]
+    facing = hillshade(Ground(0.3 * (x - y), 1.0))[10, 10]
+    averted = hillshade(Ground(0.3 * (y - x), 1.0))[10, 10]
     assert facing > averted + 50
 
 
@@ -200,3 +202,14 @@ def test_every_robot_has_its_place_in_the_strip_and_every_target_in_the_list(
     assert end <= boxes[0][1], "the list ends above the strip"
     middle = film.shots[1]
     assert film.picture(film.shots[0].frames + middle.frames // 2).std() > 4
+
+
+def test_the_map_is_darker_where_the_sun_does_not_reach():
+    heights = np.zeros((41, 81), np.float32)
+    heights[:, 60] = 1.0
+    site = Site("wall", 0, heights, 0.25, sun=SunPosition(np.radians(90), np.radians(20)))
+    shade = hillshade(Ground.of(site)).astype(float)
+    # To the west: in shadow, in light for a panel 0.3 m up, in light. The wall is 1 m high.
+    dark, half, bright = shade[20, 60 - 6], shade[20, 60 - 9], shade[20, 60 - 16]
+    assert dark < 0.7 * half < 0.7 * bright
+    assert Ground.of(make_site("flat", 0, 8.0)).light is None

@@ -272,3 +272,25 @@ def test_points_stand_on_centres_of_cells(cell_m):
     for cell in ((0, 0), (2, 4), (1, 2)):
         away = np.linalg.norm(points - network.centre(cell), axis=-1)
         assert away.min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_who_weighs_the_dark_goes_round_it_and_is_told_true_seconds():
+    raster = Raster((24, 24), 1.0)
+    slow = np.full(raster.shape, 2.0)
+    x, y = np.moveaxis(raster.points(), -1, 0)
+    weight = np.where((np.abs(x) < 3) & (y < 5), 6.0, 1.0)  # dark, but for the north
+    network = Roads.of_slowness(raster, {"rover": slow, "other": slow}, {"rover": weight})
+    start, to = (-8.0, -4.0), (8.0, -4.0)
+    straight = network.way("other", start, to)
+    assert straight.metres == pytest.approx(16.0)
+    round_it = network.way("rover", start, to)
+    assert max(round_it.points[:, 1]) > 4.7
+    assert round_it.seconds == pytest.approx(2.0 * round_it.metres, rel=1e-6)
+    assert round_it.seconds < 2.0 * 1.1 * 2 * np.hypot(8, 9)
+    told = network.matrix("rover", [start, to], [to, start, (0.0, 0.0)])
+    assert told.shape == (2, 3)
+    assert told[0, 0] == pytest.approx(round_it.seconds)
+    assert told[0, 2] == pytest.approx(2.0 * np.hypot(8, 4), rel=0.05)  # into the dark: straight
+    np.testing.assert_allclose(network.slowness("rover"), slow)
+    shut = network.close("rover", (0.0, 8.0), half=2.8)
+    assert shut.seconds("rover", start, to) > round_it.seconds

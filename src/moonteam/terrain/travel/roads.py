@@ -9,6 +9,7 @@ Legend: P points, F points from, T points to, H, W rows and columns of the raste
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,15 +21,16 @@ import numpy.typing as npt
 from moonteam.errors import InputError, meant
 from moonteam.problem.mission import Mission
 from moonteam.problem.rules import centre
+from moonteam.terrain.light import PANEL, lit_at
 from moonteam.terrain.site import Site
 from moonteam.terrain.travel.field import REACH, look_ups, renew, solve
-from moonteam.terrain.travel.lines import at
+from moonteam.terrain.travel.lines import at, line_seconds
 from moonteam.terrain.travel.raster import Raster, slowness
 from moonteam.terrain.travel.ways import way
 from moonteam.terrain.traversability import BoolMap, FloatMap, Limits
 
-MOST_FIELDS = 256
-"""Kept for each kind; the oldest goes first."""
+MOST_FIELDS, MOST_TOLD = 256, 65536
+"""Fields, and seconds of ways, kept for each kind; the oldest go first."""
 
 Place = tuple[float, float]
 Floats = npt.NDArray[np.float64]
@@ -69,6 +71,9 @@ class Fields:
     found: dict[Place, Floats] = field(default_factory=dict)  # [H + 2, W + 2] s, by target
     known: dict[Place, tuple[Floats, float]] = field(default_factory=dict)
     """Fields from before ground was closed, and up to how many s they still stand."""
+    real: Floats | None = None
+    """[H + 2, W + 2] s a spacing as they are, where `slow` weighs them to choose ways by."""
+    told: dict[tuple[Place, Place], float] = field(default_factory=dict)  # real s, by ends
 
     def field(self, to: Place) -> Floats:
         """[H + 2, W + 2] s from everywhere to the target at `to` spacings."""
@@ -94,7 +99,7 @@ class Fields:
         inner = np.pad(shut, 1) & np.isfinite(self.slow)
         if not inner.any():
             return self
-        fresh = Fields(np.where(inner, np.inf, self.slow), False)
+        fresh = Fields(np.where(inner, np.inf, self.slow), False, real=self.real)
         slowest = float(self.slow[np.isfinite(self.slow)].max())
         for to, (seconds, until) in (self.known | {
                 to: (its, math.inf) for to, its in self.found.items()}).items():
@@ -104,6 +109,26 @@ class Fields:
             elif soonest > REACH * slowest:
                 fresh.known[to] = seconds, soonest
         return fresh
+
+
+    def way(self, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
+        """Points [P, 2] spacings and seconds [P - 1] of legs as they are; no points: no way."""
+        points, legs = way(self.slow, self.field(_key(end)), *begin, *end)
+        if self.real is not None:
+            taken = [line_seconds(self.real, *a, *b) for a, b in itertools.pairwise(points)]
+            # The way out of closed ground has seconds of its own.
+            legs = np.where(np.isfinite(taken), taken, legs)
+        return points, legs
+
+    def seconds(self, begin: Floats, end: Floats) -> float:
+        """As they are, along the way that is chosen; infinite without one."""
+        ends = _key(begin), _key(end)
+        if ends not in self.told:
+            while len(self.told) >= MOST_TOLD:
+                self.told.pop(next(iter(self.told)), None)
+            points, legs = self.way(begin, end)
+            self.told[ends] = float(legs.sum()) if len(points) else math.inf
+        return self.told[ends]
 
 
 @dataclass(frozen=True)
@@ -122,14 +147,26 @@ class Roads:
                                         for kind, its in limits.items()})
 
     @classmethod
-    def of_slowness(cls, raster: Raster, slow: Mapping[str, FloatMap]) -> Roads:
-        """Where seconds per metre [H, W] are known for each kind; infinite: closed."""
-        return cls(raster, {kind: _fields(its * raster.spacing) for kind, its in slow.items()})
+    def of_slowness(cls, raster: Raster, slow: Mapping[str, FloatMap],
+                    weights: Mapping[str, FloatMap] | None = None) -> Roads:
+        """Where seconds per metre [H, W] are known for each kind; infinite: closed.
+
+        A kind that has `weights` [H, W] chooses its ways as if it took so many times as long.
+        """
+        return cls(raster, {kind: _fields(its * raster.spacing, (weights or {}).get(kind))
+                            for kind, its in slow.items()})
 
     @classmethod
     def of_mission(cls, site: Site, mission: Mission, limits: Mapping[str, Limits]) -> Roads:
-        """Over the mission's map."""
-        return cls.over(site, mission.map.size, mission.map.cell_m, limits)
+        """Over the mission's map; kinds of robots with a battery keep to the light as it says."""
+        raster = Raster(mission.map.size, mission.map.cell_m)
+        slow = {kind: slowness(site, raster, its) for kind, its in limits.items()}
+        if mission.sun is None or mission.sun.dark == 1.0 or not mission.powered():
+            return cls.of_slowness(raster, slow)
+        lit = lit_at(site, mission.sun.position(), raster.points(), PANEL)
+        weight = np.where(lit, 1.0, mission.sun.dark)
+        return cls.of_slowness(raster, slow, {
+            mission.robots[i].kind: weight for i in mission.powered()})
 
     def passable(self, kind: str, xy: Points) -> bool:
         """Whether a robot of the kind may be sent to xy [2] m."""
@@ -143,24 +180,30 @@ class Roads:
     def matrix(self, kind: str, starts: Points, to: Points) -> Floats:
         """Seconds [F, T] from each of starts [F, 2] m to each of `to` [T, 2] m."""
         its, begin, ends = self._of(kind), self._placed(starts), self._placed(to)
+        if its.real is not None:
+            return np.array([[its.seconds(a, b) for b in ends] for a in begin]).reshape(
+                len(begin), len(ends))
         if its.plain:
             return np.linalg.norm(begin[:, None] - ends[None], axis=-1) * its.slow[1, 1]
         columns = [look_ups(its.slow, its.field(_key(end)), end, begin) for end in ends]
         return np.stack(columns, axis=1) if columns else np.zeros((len(begin), 0))
 
     def field(self, kind: str, to: Points) -> FloatMap:
-        """Seconds [H, W] from every point of the raster to `to` [2] m; infinite: no way."""
+        """Seconds [H, W] from every point of the raster to `to` [2] m, weighed where the kind
+        weighs them; infinite: no way.
+        """
         return self._of(kind).field(_key(self._placed([to])[0]))[1:-1, 1:-1]
 
     def slowness(self, kind: str) -> FloatMap:
         """Seconds per metre [H, W] at every point of the raster; infinite where it is closed."""
-        return self._of(kind).slow[1:-1, 1:-1] / self.raster.spacing
+        its = self._of(kind)
+        return (its.slow if its.real is None else its.real)[1:-1, 1:-1] / self.raster.spacing
 
     def way(self, kind: str, start: Points, to: Points) -> Way:
         """The way from start [2] m to `to` [2] m. Raises InputError if there is none."""
         its, begin = self._of(kind), self._placed([start])[0]
         end = self._placed([to])[0]
-        points, legs = way(its.slow, its.field(_key(end)), *begin, *end)
+        points, legs = its.way(begin, end)
         if len(points) == 0:
             raise InputError("way", f"there is no way for a {kind} robot from "
                              f"{_written(start)} to {_written(to)} over this ground")
@@ -216,8 +259,11 @@ class Roads:
         return np.clip(points, -half, half) / self.raster.spacing + self._middle
 
 
-def _fields(slow: FloatMap) -> Fields:
-    return Fields(np.pad(slow, 1, constant_values=np.inf), bool(slow.min() == slow.max() < np.inf))
+def _fields(slow: FloatMap, weight: FloatMap | None = None) -> Fields:
+    real = np.pad(slow, 1, constant_values=np.inf)
+    if weight is not None:
+        return Fields(np.pad(slow * weight, 1, constant_values=np.inf), False, real=real)
+    return Fields(real, bool(slow.min() == slow.max() < np.inf))
 
 
 def _key(spacings: Floats) -> Place:
