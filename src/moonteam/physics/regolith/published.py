@@ -42,7 +42,7 @@ class Pull:
 
 VIPER = Climb(
     "VIPER's prototype wheel, GRC-1",
-    "experiment as plotted in uwsbel/chrono-wisc, "
+    "NASA Glenn's tests as plotted in uwsbel/chrono-wisc, "
     "python_scripts/viper_singleWheel_DepthVar_plotting.py",
     Shape(0.225, 0.2, 0.03), 17.5, 0.8,
     (0.27, 5.24, 10.03, 14.96, 20.23, 25.10), (0.032, 0.052, 0.135, 0.434, 0.756, 0.885))
