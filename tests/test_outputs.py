@@ -263,6 +263,8 @@ WRITERS = {
     "evaluate preference": ("evaluate preference 3x5 --policy any_team", "preference.png"),
     "evaluate traverse": ("evaluate traverse", "wheeled-rim.mp4"),
     "evaluate slopes": ("evaluate slopes", "slopes.json"),
+    "evaluate soil": ("evaluate soil", "soil.png"),
+    "evaluate paces": ("evaluate paces", "paces.json"),
     "evaluate execution": ("evaluate execution", "rows.jsonl"),
     "evaluate sensitivity": ("evaluate sensitivity", "curves.png"),
     "evaluate soak": ("evaluate soak", "rows.jsonl"),
