@@ -6,6 +6,7 @@ depends on wall-clock time: the same record gives the same report.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from moonteam.problem.mission import Mission, Place
 from moonteam.problem.scenario import Cell
 from moonteam.robots.base import Height, RobotKind
+from moonteam.terrain import soil as soils
 from sim2grid.frame import Frame, tilt
 from sim2grid.loop.record import Leg, Record
 from sim2grid.measure.slip import expected, slip
@@ -158,6 +160,16 @@ class Optimum(msgspec.Struct, frozen=True):
     optimum_steps: int | None = None
 
 
+class SoilDrawn(msgspec.Struct, frozen=True):
+    """The soil of a mission's site, as its seed has drawn it."""
+
+    name: str
+    k_phi: float  # N/m^(n+2)
+    cohesion_pa: float
+    friction_deg: float
+    shear_m: float
+
+
 class Report(msgspec.Struct, frozen=True):
     """`report.json`: everything but wall-clock time, so equal seeds give equal reports."""
 
@@ -180,6 +192,7 @@ class Report(msgspec.Struct, frozen=True):
     robots: tuple[RobotReport, ...]
     expected_s: float | None = None  # by the clock, what the first plan took in all
     optimum: Optimum | None = None  # of a rollout, where it is proved in time
+    soil: SoilDrawn | msgspec.UnsetType = msgspec.UNSET  # what it ran on; unset on rigid ground
 
 
 def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]:
@@ -293,7 +306,17 @@ def make_report(record: Record, mission: Mission, frame: Frame, bases: Sequence[
         moves=sum(r.moves for r in robots), grid_plan=grid_plan, inflation=inflation,
         replans=dict(sorted(Counter(cause for _, cause in record.replans).items())),
         targets=target_reports(record, mission), robots=robots,
-        expected_s=_round(max(record.expected.values())) if record.expected else None)
+        expected_s=_round(max(record.expected.values())) if record.expected else None,
+        soil=soil_drawn(mission))
+
+
+def soil_drawn(mission: Mission) -> SoilDrawn | msgspec.UnsetType:
+    """What a mission's ground is made of; unset where it is rigid."""
+    if mission.site.ground == "rigid":
+        return msgspec.UNSET
+    its = soils.drawn(soils.find(mission.site.soil), mission.site.seed)
+    return SoilDrawn(its.name, _round(its.k_phi, 0), _round(its.cohesion, 1),
+                     _round(math.degrees(its.friction), 2), _round(its.shear))
 
 
 def _round(value: float, digits: int = 4) -> float:

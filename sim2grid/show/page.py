@@ -168,7 +168,7 @@ def rollout_page(report: Report, *, command: str, made: Path | None, out: Path,
         *(["<h2>Replay in 3-D</h2>", replay] if replay else []),
         "<h2>Video</h2>", video(made, out),
         "<h2>Targets</h2>", _targets(report), "<h2>Robots</h2>", _robots(report),
-        *_power(report),
+        *_power(report), *_soil(report),
         *([] if not replans else ["<h2>New plans</h2>", table(
             ["time s", "decision", "cause"], replans)]),
         *[part for title, svg in plots for part in (
@@ -185,6 +185,16 @@ def _beside(best: Optimum) -> list[tuple[str, Any]]:
     at = "" if best.plan_steps is None else " at travelling speed"
     return [*steps, (f"plan, s{at}", round(best.plan_s, 1)),
             (f"certified optimum, s{at}", round(best.optimum_s, 1))]
+
+
+def _soil(report: Report) -> list[str]:
+    """What the ground was made of, where it gives way."""
+    its = report.soil
+    if its is msgspec.UNSET:
+        return []
+    return [f"<p>Regolith, {html.escape(its.name)}, as this site's seed draws it: friction "
+            f"{its.friction_deg:.1f} deg, cohesion {its.cohesion_pa:.0f} Pa, stiffness "
+            f"{its.k_phi:.3g} N/m^(n+2), shear {1e3 * its.shear_m:.0f} mm.</p>"]
 
 
 def _targets(report: Report) -> str:

@@ -1,12 +1,15 @@
 """The rover: wheels that roll, slopes that it climbs and refuses, torques within limits."""
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from moonteam.robots import wheeled
-from moonteam.robots.base import GRAVITY, Command
+from moonteam.robots.base import CONTROL_PERIOD, GRAVITY, Command
 from moonteam.robots.wheeled import WHEELED
+from moonteam.terrain.surface import Surface
 
 WHEELS = 7 + wheeled.WHEELS, 6 + wheeled.WHEELS  # in qpos, in qvel
 
@@ -137,3 +140,41 @@ def test_weight_rests_on_the_wheels(make_world, ground):
         mujoco.mj_contactForce(world.scene.model, world.data, contact, force)
         total += force[0]
     assert total == pytest.approx(wheeled.MASS * GRAVITY, rel=0.01)
+
+
+def pulled(soft, seconds, spinning=0.45):
+    """Mean of the wheels' torques N m, a step each, of a rover whose wheels spin on the spot."""
+    surface = Surface(jnp.zeros((41, 41)), 0.25, soft=soft)
+    control = jax.jit(WHEELED.control)
+    qpos = np.zeros(13, np.float32)
+    qpos[2], qpos[3] = wheeled.STANDING_HEIGHT, 1.0
+    qvel = np.zeros(12, np.float32)
+    state, torques = WHEELED.init(qpos, qvel), []
+    for step in range(round(seconds / CONTROL_PERIOD)):
+        backs = float(state.backing) > 0.0
+        # Once it backs out its wheels turn as they are told to.
+        qvel[WHEELS[1]] = (-wheeled.BACK_SPEED if backs else spinning) / wheeled.WHEEL_RADIUS
+        qvel[0] = -wheeled.BACK_SPEED if backs else 0.0
+        torque, state, _ = control(state, np.float32(step * CONTROL_PERIOD), qpos, qvel,
+                                   to((4.0, 0.0)), surface)
+        torques.append((float(np.mean(torque)), float(state.backing), bool(state.reverse)))
+    return np.array(torques)
+
+
+def test_a_rover_that_digs_itself_in_backs_out_and_tries_again():
+    steps = pulled(True, 6.0)
+    backing = steps[:, 1] > 0.0
+    first = round(wheeled.PATIENCE / CONTROL_PERIOD)
+    assert not backing[:first - 2].any(), "it has patience"
+    assert backing[first:first + round(0.9 * wheeled.BACK_OUT / CONTROL_PERIOD)].all()
+    again = first + round(1.2 * wheeled.BACK_OUT / CONTROL_PERIOD)
+    assert not backing[again:again + 50].any(), "then it tries again"
+
+
+def test_on_rigid_ground_it_never_backs_out():
+    assert not (pulled(False, 4.0)[:, 1] > 0.0).any()
+
+
+def test_wheels_that_grip_dig_nothing():
+    steps = pulled(True, 4.0, spinning=0.05)
+    assert not (steps[:, 1] > 0.0).any(), "too slow to dig"
