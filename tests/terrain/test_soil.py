@@ -70,7 +70,8 @@ def test_a_mission_chooses_its_ground(tmp_path):
 
 @pytest.mark.parametrize(("more", "words"), [
     (", ground: mud", "site.ground: unknown value 'mud'; allowed: regolith, rigid"),
-    (", ground: regolith, soil: clay", "unknown value 'clay'; allowed: dense, grc1, loose, lunar, nominal"),
+    (", ground: regolith, soil: clay",
+     "unknown value 'clay'; allowed: dense, grc1, loose, lunar, nominal"),
     (", soil: loose", "site.soil: is of ground: regolith, which is not given"),
     (", fields: rigid", "site.fields: is of ground: regolith, which is not given"),
 ])
