@@ -144,9 +144,8 @@ def standing(grounds: Grounds | None, batch: int, which: npt.ArrayLike | None) -
     """
     have = 1 if grounds is None else len(grounds.sites)
     index = np.broadcast_to(np.asarray(0 if which is None else which, np.int32), (batch,))
-    if index.size and not (0 <= index.min() and index.max() < have):
-        raise ValueError(f"ground {index.max() if index.max() >= have else index.min()} of a world "
-                         f"is not allowed; the scene has 0 to {have - 1}")
+    for one in index[(index < 0) | (index >= have)].tolist():
+        raise ValueError(f"ground {one} of a world is not allowed; the scene has 0 to {have - 1}")
     return None if grounds is None else jnp.asarray(index)
 
 
