@@ -112,7 +112,8 @@ def _document(args: Args, rows: list[dict[str, Any]]) -> dict[str, Any]:
         f"Robots: {', '.join(kind for _, kind in TEAM)}; {args.targets} targets, {args.side} x "
         f"{args.side} cells "
         f"of {args.cell:g} m on "
-        + (f"{args.sites} sites of " if args.sites > 1 else "") + f"{args.site}; decisions by {args.planner}"
+        + (f"{args.sites} sites of " if args.sites > 1 else "")
+        + f"{args.site}; decisions by {args.planner}"
         + (f" {Path(args.policy).stem}." if args.planner == "policy" else "."),
         "fused: one program on MJX for decisions, control and physics. native, mjx: step by step."]
     return {"title": "execution speed", "command": "bench execution", "device": device_name(),

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from sim2grid.study.evaluation import Evaluation
     from sim2grid.study.fleet import Given, Recipe
 
-DRAWN = ("team", "site", "sites", "count", "cell", "lose", "slow", "silent", "new_targets", "impassable",
-         "site_seed", "targets", "side", "max_steps", *(field.name for field in fields(Elevation)))
+DRAWN = ("team", "site", "sites", "count", "cell", "lose", "slow", "silent", "new_targets",
+         "impassable", "site_seed", "targets", "side", "max_steps",
+         *(field.name for field in fields(Elevation)))
 """Options of random missions, which a mission that is given answers itself."""
 
 FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")
@@ -38,8 +39,8 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     Missions are those of --mission, or random: one robot of each of our own kinds, or the --team,
     random skills where that says none, random targets and, if asked for, random events, all of a
     site on the same ground, which may be that of a --dem, or with --sites on many grounds at once.
-    A row of the table is a loop with a planner and a mode: closed (the planner decides again at each
-    step, from where the robots really are), open (the grid plan walked through blindly, all
+    A row of the table is a loop with a planner and a mode: closed (the planner decides again at
+    each step, from where the robots really are), open (the grid plan walked through blindly, all
     robots in lockstep), oracle (closed with the exact planner) and grid (no physics).
     Exit code 0 whatever the missions came to, 130 if interrupted, with what is done saved.
 
@@ -164,8 +165,9 @@ def _carry_out(args: Args, made: Sequence[Mission], workers: Cluster | None
 def _check(args: Args) -> None:
     """Raises InputError for options out of range."""
     journal.check(args, (
-        ("count", 1, 100_000), ("sites", 1, 4096), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
-        ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096), ("threads", 0, 1024),
+        ("count", 1, 100_000), ("sites", 1, 4096), ("targets", 1, 64), ("side", 4, 128),
+        ("max_steps", 1, 100_000), ("seed", 0, 2**31), ("site_seed", 0, 2**31),
+        ("width", 1, 4096), ("threads", 0, 1024),
         ("new_targets", 0, 64), ("impassable", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1),
         ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
 
