@@ -378,7 +378,7 @@ class Group:
 
     def _keep(self, contender: Contender, k: int, report: Report, nominal_s: float | None
               ) -> None:
-        site, site_seed = self._fleet.place(k)
+        site, site_seed = self._fleet.place_of(k)
         losses = {robot.lost for robot in report.robots if robot.lost}
         by_event = report.cause == "unsolvable" and losses == {"event"}
         row = Row(number=self._first + k, contender=contender.name, site=site,

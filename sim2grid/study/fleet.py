@@ -95,9 +95,9 @@ class Recipe:
 
     def of_site(self, index: int) -> Recipe:
         """Of one of its sites alone."""
-        seed = self.site_seed + index
-        ground = self.ground and msgspec.structs.replace(self.ground, seed=seed)
-        return replace(self, site_seed=seed, ground=ground, sites=1)
+        ground = self.ground and msgspec.structs.replace(
+            self.ground, seed=self.ground.seed + index)
+        return replace(self, site_seed=self.site_seed + index, ground=ground, sites=1)
 
     @property
     def source(self) -> str:
@@ -162,7 +162,7 @@ class Fleet:
         """The ground of mission `k`."""
         return self.scene.sites[self.grounds[k]] if self.grounds else self.site
 
-    def place(self, k: int) -> tuple[str, int]:
+    def place_of(self, k: int) -> tuple[str, int]:
         """Name and seed of mission `k`'s ground, by which rows are put together."""
         site = self.site_of(k)
         return (self.label, 0) if self.label else (site.name, site.seed)
