@@ -44,6 +44,8 @@ class Args(Missions, Reported):
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
     site: Literal["mare", "highland", "crater_rim", "polar", "flat"] = "mare"
     """Preset of the ground."""
+    sites: int = 1
+    """Sites, with seeds from --site-seed on, that the missions go round; 1: all on one ground."""
     cell: float = 1.0
     """Metres a side of a cell."""
     seconds: float = 600.0
@@ -54,6 +56,8 @@ def run(args: Args) -> int:
     """Measures and prints; 0."""
     if min(args.missions, default=0) < 1:
         raise InputError("--missions", "at least one number, each at least 1")
+    if not 1 <= args.sites <= 4096:
+        raise InputError("--sites", f"{args.sites} is not allowed; 1 to 4096")
     if not 1.0 <= args.seconds <= 36000.0:
         raise InputError("--seconds", f"{args.seconds:g} is not allowed; 1 to 36000")
     compilation.enable_cache()
@@ -64,7 +68,8 @@ def run(args: Args) -> int:
 
     decider, params = _decider(args)
     recipe = Recipe(args.site, args.site_seed, args.seed, num_targets=args.targets,
-                    side=args.side, cell_m=args.cell, max_steps=args.max_steps)
+                    side=args.side, cell_m=args.cell, max_steps=args.max_steps,
+                    sites=args.sites)
     rows = []
     for count in dict.fromkeys(args.missions):
         fleet = make_fleet(recipe, count)
@@ -106,7 +111,9 @@ def _document(args: Args, rows: list[dict[str, Any]]) -> dict[str, Any]:
     notes = [
         f"Robots: {', '.join(kind for _, kind in TEAM)}; {args.targets} targets, {args.side} x "
         f"{args.side} cells "
-        f"of {args.cell:g} m on {args.site}; decisions by {args.planner}"
+        f"of {args.cell:g} m on "
+        + (f"{args.sites} sites of " if args.sites > 1 else "")
+        + f"{args.site}; decisions by {args.planner}"
         + (f" {Path(args.policy).stem}." if args.planner == "policy" else "."),
         "fused: one program on MJX for decisions, control and physics. native, mjx: step by step."]
     return {"title": "execution speed", "command": "bench execution", "device": device_name(),

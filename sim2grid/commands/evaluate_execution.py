@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from sim2grid.study.evaluation import Evaluation
     from sim2grid.study.fleet import Given, Recipe
 
-DRAWN = ("team", "site", "count", "cell", "lose", "slow", "silent", "new_targets", "impassable",
-         "site_seed", "targets", "side", "max_steps", "ground", "soil", "fields",
+DRAWN = ("team", "site", "sites", "count", "cell", "lose", "slow", "silent", "new_targets",
+         "impassable", "site_seed", "targets", "side", "max_steps", "ground", "soil", "fields",
          *(field.name for field in fields(Elevation)))
 """Options of random missions, which a mission that is given answers itself."""
 
@@ -39,9 +39,9 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
 
     Missions are those of --mission, or random: one robot of each of our own kinds, or the --team,
     random skills where that says none, random targets and, if asked for, random events, all of a
-    site on the same ground, which may be that of a --dem. A row of
-    the table is a loop with a planner and a mode: closed (the planner decides again at each
-    step, from where the robots really are), open (the grid plan walked through blindly, all
+    site on the same ground, which may be that of a --dem, or with --sites on many grounds at once.
+    A row of the table is a loop with a planner and a mode: closed (the planner decides again at
+    each step, from where the robots really are), open (the grid plan walked through blindly, all
     robots in lockstep), oracle (closed with the exact planner) and grid (no physics).
     Exit code 0 whatever the missions came to, 130 if interrupted, with what is done saved.
 
@@ -58,6 +58,7 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
       moonteam evaluate execution --mission outpost my_mission.yaml --planner exact policy
       moonteam evaluate execution --team scout.py:SCOUT:A,rover.py:ROVER:AB --planner my.py:Planner
       moonteam evaluate execution --dem moon.tif --units degrees --centre -89.4 222 --side 24
+      moonteam evaluate execution --site highland --sites 64 --count 256 --width 256
       moonteam evaluate execution --count 500 --on ray://head:10001 --out runs/many
     """
 
@@ -76,8 +77,11 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     fields: Literal["measured", "rigid"] = "measured"
     """What plans believe of regolith: how each kind was measured on that soil, or as on rigid
     ground. The missions are the same."""
+    sites: int = 1
+    """Sites of each preset, with seeds from --site-seed on, which its missions go round; the engine
+    has a different ground in each world."""
     count: int = 20
-    """Missions a site."""
+    """Missions of each preset, or of the --dem."""
     loop: tuple[Literal["closed", "open", "oracle", "grid"], ...] = ("closed",)
     """Which baselines stand in the table."""
     mode: tuple[Literal["barrier", "async", "clock"], ...] = ("barrier",)
@@ -169,8 +173,9 @@ def _carry_out(args: Args, made: Sequence[Mission], workers: Cluster | None
 def _check(args: Args) -> None:
     """Raises InputError for options out of range."""
     journal.check(args, (
-        ("count", 1, 100_000), ("targets", 1, 64), ("side", 4, 128), ("max_steps", 1, 100_000),
-        ("seed", 0, 2**31), ("site_seed", 0, 2**31), ("width", 1, 4096), ("threads", 0, 1024),
+        ("count", 1, 100_000), ("sites", 1, 4096), ("targets", 1, 64), ("side", 4, 128),
+        ("max_steps", 1, 100_000), ("seed", 0, 2**31), ("site_seed", 0, 2**31),
+        ("width", 1, 4096), ("threads", 0, 1024),
         ("new_targets", 0, 64), ("impassable", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1),
         ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
 
@@ -199,6 +204,8 @@ def _recipes(args: Args) -> list[Recipe]:
     if args.dem is None:
         for name in args.model_options():
             raise InputError(command.flag(name), "is for an elevation model; give --dem too")
+    if args.dem is not None and args.sites > 1:
+        raise InputError("--sites", "is for presets; a --dem has one ground")
     if args.dem is not None and args.site != Args().site:
         raise InputError("--site", "give presets or an elevation model, not both; it has --dem")
     team, skills = parse_team(args.team) if args.team else (TEAM, ())
@@ -218,7 +225,7 @@ def _recipes(args: Args) -> list[Recipe]:
     # The exact planner, whose plans say which missions can be, takes 6 robots.
     return [Recipe(name, args.site_seed, args.seed, args.targets, args.side, args.cell,
                    args.max_steps, rates, team, "exact" if len(team) <= 6 else "greedy", skills,
-                   ground) for name, ground in grounds]
+                   ground, args.sites) for name, ground in grounds]
 
 
 def _given(args: Args, made: Sequence[Mission]) -> list[Given]:
@@ -251,6 +258,8 @@ def _options(args: Args) -> dict[str, Any]:
         options["dem"] = os.fspath(args.dem)
     if args.mission:
         options["count"] = 1  # of each
+    if args.sites == 1:
+        del options["sites"]
     rates = {name: options.pop(name)
              for name in ("lose", "slow", "silent", "new_targets", "impassable")}
     return options | {"rates": rates}

@@ -72,8 +72,11 @@ class Backend(Protocol):
 
     log_every: int  # control steps between two samples of the log
 
-    def reset(self, qpos: Any = None, batch: int = 1) -> Any:
-        """Worlds at rest at qpos [B, nq]; a state's arrays have B rows, `diverged` is [B] bool."""
+    def reset(self, qpos: Any = None, batch: int = 1, /) -> Any:
+        """Worlds at rest at qpos [B, nq]; a state's arrays have B rows, `diverged` is [B] bool.
+
+        Of an engine whose scene has several grounds, `which` [B] comes third.
+        """
         ...
 
     def advance(self, state: Any, commands: tuple[Command, ...],
@@ -84,7 +87,8 @@ class Backend(Protocol):
 
 def run(executions: Sequence[Driven], backend: Backend, qpos: npt.ArrayLike,
         progress: Callable[[], None] = lambda: None, *, width: int = 0,
-        rows: Sequence[int] = (), finished: Callable[[int], None] = lambda index: None) -> None:
+        rows: Sequence[int] = (), finished: Callable[[int], None] = lambda index: None,
+        grounds: Sequence[int] = ()) -> None:
     """Drives executions on the rows of a backend to their ends.
 
     Executions of one row run one after the other. Floating point can differ between rows but
@@ -99,6 +103,7 @@ def run(executions: Sequence[Driven], backend: Backend, qpos: npt.ArrayLike,
       width: B; 0 for as many as there are executions.
       rows: the row of each execution; empty: they are dealt out in order.
       finished: called with the index of each execution that has ended.
+      grounds: index of the ground of each execution, where the backend's scene has several.
 
     Ctrl-C ends those under way where they stand and is raised again.
     """
@@ -107,7 +112,7 @@ def run(executions: Sequence[Driven], backend: Backend, qpos: npt.ArrayLike,
     poses = np.broadcast_to(poses, (len(executions), poses.shape[-1]))
     rows = rows or [k % width for k in range(len(executions))]
     queues = [[k for k, row in enumerate(rows) if row == b] for b in range(width)]
-    fleet = Rows(executions, backend, poses, queues)
+    fleet = Rows(executions, backend, poses, queues, grounds)
     try:
         while fleet.load(finished):
             fleet.answer()
@@ -123,9 +128,9 @@ class Rows:
     """The rows of a backend and the executions that take turns in them."""
 
     def __init__(self, executions: Sequence[Driven], backend: Backend, poses: npt.NDArray,
-                 queues: list[list[int]]):
+                 queues: list[list[int]], grounds: Sequence[int] = ()):
         self._executions, self._backend, self._queues = executions, backend, queues
-        self._poses, self._rules = poses, executions[0].asked.rules
+        self._poses, self._rules, self._grounds = poses, executions[0].asked.rules, grounds
         self._now: list[int | None] = [None] * len(queues)
         self._idle = np.ones(len(queues), bool)
         self._state: Any = None
@@ -161,8 +166,9 @@ class Rows:
 
     def _reset(self, fresh: npt.NDArray[np.bool_]) -> None:
         """Puts the rows that are fresh [B] at their starts."""
-        places = np.stack([self._poses[0 if k is None else k] for k in self._now])
-        start = self._backend.reset(places, len(places))
+        shown = [0 if k is None else k for k in self._now]
+        which = [[self._grounds[k] for k in shown]] if self._grounds else []
+        start = self._backend.reset(self._poses[shown], len(shown), *which)
         if self._state is None:
             self._state = start
             return

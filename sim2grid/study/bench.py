@@ -68,9 +68,10 @@ def _fused(fleet: Fleet, decider: Decider, params: Any, max_steps: int, seconds:
            ) -> tuple[float, float, float, float, int]:
     program = Fused(MjxBackend(fleet.scene), fleet.frame, fleet.bodies, decider,
                     max_steps=max_steps, seconds=seconds)
-    compile_s = program.compile(fleet.scenarios, fleet.starts, params)
+    compile_s = program.compile(fleet.scenarios, fleet.starts, params, fleet.grounds)
     begun, cpu = time.perf_counter(), time.process_time()
-    outcome = jax.block_until_ready(program.run(fleet.scenarios, fleet.starts, params))
+    outcome = jax.block_until_ready(
+        program.run(fleet.scenarios, fleet.starts, params, fleet.grounds))
     wall, cpu = time.perf_counter() - begun, time.process_time() - cpu
     now = outcome.progress
     simulated = float(np.asarray(now.look).sum()) * program.setup.rules.chunk_s
@@ -88,7 +89,7 @@ def _stepwise(fleet: Fleet, engine: str, decider: Decider, params: Any
     planner.act(executions[0].snapshot)
     compile_s += time.perf_counter() - begun
     begun, cpu = time.perf_counter(), time.process_time()
-    run(executions, backend, fleet.starts)
+    run(executions, backend, fleet.starts, grounds=fleet.grounds)
     wall, cpu = time.perf_counter() - begun, time.process_time() - cpu
     simulated = sum(execution.record.seconds() for execution in executions)
     return compile_s, wall, cpu, simulated, sum(e.record.success for e in executions)

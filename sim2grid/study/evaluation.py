@@ -21,7 +21,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -167,7 +167,7 @@ class OnGrid(Promise):
 
 @dataclass
 class Evaluation:
-    """Missions of several sites and the contenders that try them.
+    """Missions of several recipes, each of a site or more, and the contenders that try them.
 
     `rows` holds what is done, by contender and number; `keep` is called with each new row.
     """
@@ -253,14 +253,14 @@ class Evaluation:
 
 
 class Group:
-    """The missions of one site."""
+    """The missions of one recipe."""
 
     def __init__(self, evaluation: Evaluation, fleet: Fleet, first: int):
         self._all, self._fleet, self._first = evaluation, fleet, first
-        self._height = ground_height(fleet.site.heights, fleet.site.spacing)
         self._width = min(evaluation.width, len(fleet.missions))
         self._engines: dict[str, Backend] = {}
         self._plans: dict[tuple, dict[int, OnGrid]] = {}
+        self._roads: dict[int, Roads] = {}
 
     def run(self) -> None:
         """All contenders."""
@@ -294,6 +294,7 @@ class Group:
         done = len(self._fleet.missions) - len(todo)
         total = len(self._fleet.missions)
         name = self._fleet.missions[0].name if self._fleet.label else self._fleet.site.name
+        grounds = [self._fleet.grounds[k] for k in todo] if self._fleet.grounds else []
         title = f"{self._all.label}{name}: {contender.name}"
 
         def finished(index: int) -> None:
@@ -311,10 +312,11 @@ class Group:
             if contender.backend == "fused":
                 whole.run([one for one in executions if isinstance(one, Execution)],
                           MjxBackend(self._fleet.scene), self._fleet.starts[todo], self._width,
-                          finished)
+                          finished, grounds)
                 return
             run(executions, self._backend(contender.backend), self._fleet.starts[todo],
-                width=self._width, rows=[k % self._width for k in todo], finished=finished)
+                width=self._width, rows=[k % self._width for k in todo], finished=finished,
+                grounds=grounds)
 
     def _backend(self, name: str) -> Backend:
         if name not in self._engines:
@@ -337,12 +339,17 @@ class Group:
         bodies = fleet.bodies if settling else [replace(body, settle=0.0) for body in fleet.bodies]
         mission = by_the_clock(fleet.missions[k], "--mode clock")
         return TimedExecution(mission, fleet.scenarios[k], chooser(contender), bodies,
-                              fleet.frame, self._roads, seed=self._seed(k))
+                              fleet.frame, self._roads_of(k), seed=self._seed(k))
 
-    @cached_property
-    def _roads(self) -> Roads:
+    def _roads_of(self, k: int) -> Roads:
+        """The ways over mission `k`'s ground."""
         fleet = self._fleet
-        return Roads.of_mission(fleet.site, fleet.missions[0], team.limits(fleet.kinds, fleet.site))
+        ground = fleet.grounds[k] if fleet.grounds else 0
+        if ground not in self._roads:
+            site = fleet.site_of(k)
+            self._roads[ground] = Roads.of_mission(
+                site, fleet.missions[k], team.limits(fleet.kinds, site))
+        return self._roads[ground]
 
     def _promises(self, contender: Contender, todo: Iterable[int]) -> dict[int, Promise]:
         """What a planner by the clock makes of each mission at its start, ways alone counted."""
@@ -363,15 +370,16 @@ class Group:
     def _report(self, contender: Contender, k: int, record: Record, plan: GridPlan | None
                 ) -> Report:
         objective = None if contender.planner == "policy" else contender.objective
+        site = self._fleet.site_of(k)
         return make_report(
             record, self._fleet.missions[k], self._fleet.frame, self._fleet.bases,
             planner=contender.who, objective=objective, mode=contender.mode,
             backend=contender.backend, seed=self._seed(k), grid_plan=plan, kinds=self._fleet.kinds,
-            height=self._height)
+            height=ground_height(site.heights, site.spacing))
 
     def _keep(self, contender: Contender, k: int, report: Report, nominal_s: float | None
               ) -> None:
-        site, site_seed = self._fleet.place
+        site, site_seed = self._fleet.place_of(k)
         losses = {robot.lost for robot in report.robots if robot.lost}
         by_event = report.cause == "unsolvable" and losses == {"event"}
         row = Row(number=self._first + k, contender=contender.name, site=site,

@@ -13,7 +13,14 @@ from moonteam.report.markup import Raw, table
 from sim2grid.show import plots
 from sim2grid.show.page import folded, known, mean_interval, page, plot, tiles
 from sim2grid.study.mission_cards import cards, optimum, rollout_command
-from sim2grid.study.summary import COMPARED, DIFFERENT, compared_rows, different_rows, where
+from sim2grid.study.summary import (
+    COMPARED,
+    DIFFERENT,
+    compared_rows,
+    different_rows,
+    first_seed,
+    where,
+)
 
 MOST_FAILURES = 200
 """Failed missions that the page lists one by one; report.json has all."""
@@ -83,7 +90,8 @@ def best_means(document: dict[str, Any]) -> dict[tuple[str, int, str], float]:
     groups: dict[tuple[str, int, str], list[float]] = {}
     for row in document["rows"]:
         if row["report"]["success"] and (value := best[row["number"]]) is not None:
-            groups.setdefault((row["site"], row["site_seed"], row["contender"]), []).append(value)
+            first = first_seed(document.get("options", {}), row["site_seed"])
+            groups.setdefault((row["site"], first, row["contender"]), []).append(value)
     return {key: sum(values) / len(values) for key, values in groups.items()}
 
 
@@ -142,14 +150,17 @@ def failures_table(document: dict[str, Any], source: str) -> str:
 
 def histogram_plots(document: dict[str, Any]) -> str:
     """Seconds and inflation of the missions that succeeded, contender by contender."""
-    many = len({(row["site"], row["site_seed"]) for row in document["rows"]}) > 1
+    options = document.get("options", {})
+    many = len({(line["site"], line["site_seed"]) for line in document["summary"]}) > 1
 
     def by_contender(read: Callable[[Row], float | None]) -> dict[str, list[float]]:
         groups: dict[str, list[float]] = {}
         for row in document["rows"]:
             value = read(row) if row["report"]["success"] else None
             if value is not None:
-                site = f", {where(row)}" if many else ""
+                place = {"site": row["site"], "sites": options.get("sites", 1),
+                         "site_seed": first_seed(options, row["site_seed"])}
+                site = f", {where(place)}" if many else ""
                 groups.setdefault(row["contender"] + site, []).append(value)
         return groups
 

@@ -1,4 +1,4 @@
-"""Random missions on one site: many worlds of one scene, drawn from seeds.
+"""Random missions on one site, or on several in turn: many worlds of one scene, from seeds.
 
 Skills, targets and cells are drawn as in training (`grid.scenarios`); a draw is repeated where
 the ground forbids it: a start that the kind cannot stand on, a target that the robots with its
@@ -86,11 +86,18 @@ class Recipe:
     planner: str = "exact"  # whose plan says that it can be done in time, and when events come
     skills: tuple[tuple[str, ...], ...] = ()  # of each robot; those of one with none are drawn
     ground: Site | None = None  # in place of the preset, which then is but its name
+    sites: int = 1  # seeds of the ground, from site_seed on, which its missions go round
 
     @property
     def site(self) -> Site:
         """The ground, as a mission names it."""
         return self.ground or Site(preset=self.preset, seed=self.site_seed)
+
+    def of_site(self, index: int) -> Recipe:
+        """Of one of its sites alone."""
+        ground = self.ground and msgspec.structs.replace(
+            self.ground, seed=self.ground.seed + index)
+        return replace(self, site_seed=self.site_seed + index, ground=ground, sites=1)
 
     @property
     def source(self) -> str:
@@ -131,7 +138,11 @@ GIVEN = "missions"
 
 @dataclass(frozen=True)
 class Fleet:
-    """Missions of the same robots on the same ground, with what their executions need."""
+    """Missions of the same robots, with what their executions need.
+
+    All are on the same ground, or each on one of `scene.sites` by `grounds`; then `site` and
+    `passable` are the first's.
+    """
 
     missions: tuple[Mission, ...]
     draws: tuple[int, ...]  # how often each was drawn until the ground allowed it
@@ -145,11 +156,16 @@ class Fleet:
     starts: npt.NDArray[np.float64]  # [F, nq]
     written: tuple[Mission, ...] = ()  # where a kind may be FILE.py:OBJECT; as `missions` if empty
     label: str = ""  # in place of the site's name
+    grounds: tuple[int, ...] = ()  # [F] of each mission, where there are several
 
-    @property
-    def place(self) -> tuple[str, int]:
-        """Name and seed of the ground, by which rows are put together."""
-        return (self.label, 0) if self.label else (self.site.name, self.site.seed)
+    def site_of(self, k: int) -> Ground:
+        """The ground of mission `k`."""
+        return self.scene.sites[self.grounds[k]] if self.grounds else self.site
+
+    def place_of(self, k: int) -> tuple[str, int]:
+        """Name and seed of mission `k`'s ground, by which rows are put together."""
+        site = self.site_of(k)
+        return (self.label, 0) if self.label else (site.name, site.seed)
 
     def entry(self, k: int) -> Mission:
         """Mission `k` as a file would have it."""
@@ -201,19 +217,22 @@ def make_fleet(recipe: Recipe | Given, count: int,
                change: Callable[[Ground], Ground] = lambda ground: ground) -> Fleet:
     """The first `count` missions of a recipe, on their ground after a `change`.
 
-    Raises InputError for numbers out of range, or ground that allows no mission.
+    Of G sites missions go round: mission k is the k // G-th of site k % G alone. Raises InputError
+    for numbers out of range, or ground that allows no mission.
     """
     if isinstance(recipe, Given):
         return fleet_of_one(recipe.mission(), recipe.name)
-    site, passable = ground_of(recipe, change)
-    able = passable
-    if not site.known:
-        # The same missions whatever is believed of the ground.
-        measured = msgspec.structs.replace(recipe.site, fields="measured")
-        _, able = ground_of(replace(recipe, ground=measured), change)
-    drawn = [draw_mission(recipe, number, site, able) for number in range(count)]
+    alone = [recipe.of_site(index) for index in range(min(recipe.sites, count))]
+    made = [ground_of(its, change) for its in alone]
+    standing = [k % len(made) for k in range(count)]
+    # The same missions whatever is believed of the ground.
+    able = made if all(site.known for site, _ in made) else [
+        ground_of(replace(its, ground=msgspec.structs.replace(its.site, fields="measured")), change)
+        for its in alone]
+    drawn = [draw_mission(alone[g], k // len(made), made[g][0], able[g][1])
+             for k, g in enumerate(standing)]
     chosen, kinds = [mission for mission, _ in drawn], crew(recipe)
-    fleet = fleet_of(chosen, [draws for _, draws in drawn], site, passable, kinds)
+    fleet = _fleet(chosen, [draws for _, draws in drawn], made, standing, kinds)
     files = {kinds[i].name: os.fspath(Path(written).resolve())
              for i, (_, written) in enumerate(recipe.team) if ".py:" in written}
     return replace(fleet, written=tuple(
@@ -260,20 +279,31 @@ def fleet_of(chosen: list[Mission], draws: list[int], site: Ground,
 
     `kinds` are those of the robots; without them kinds are registered.
     """
+    return _fleet(chosen, draws, [(site, passable)], [0] * len(chosen), kinds)
+
+
+def _fleet(chosen: list[Mission], draws: list[int],
+           made: Sequence[tuple[Ground, dict[str, BoolArray]]], standing: Sequence[int],
+           kinds: Sequence[RobotKind]) -> Fleet:
+    """Missions of the same robots, each on one of the sites `made` by `standing` [F], the first on
+    the first; as `ground_of` gives these.
+    """
     frame = Frame(chosen[0].map.size, chosen[0].map.cell_m)
     kinds = kinds or [KINDS.get(robot.kind) for robot in chosen[0].robots]
-    scene = build_scene(site, placements(chosen[0], frame, kinds))
+    scene = build_scene([site for site, _ in made], placements(chosen[0], frame, kinds))
     starts = []
-    for mission in chosen:
+    for mission, g in zip(chosen, standing, strict=True):
         pose = scene.qpos0.copy()
         for robot, placement in zip(scene.robots, placements(mission, frame, kinds),
                                     strict=True):
-            pose[robot.qpos] = start_pose(site, placement)
+            pose[robot.qpos] = start_pose(made[g][0], placement)
         starts.append(pose)
     return Fleet(tuple(chosen), tuple(draws),
-                 tuple(grid_problem(mission, passable) for mission in chosen),
-                 frame, site, passable, {r.kind.name: r.kind for r in scene.robots}, scene,
-                 bodies_of(scene), np.stack(starts))
+                 tuple(grid_problem(mission, made[g][1])
+                       for mission, g in zip(chosen, standing, strict=True)),
+                 frame, *made[0], {r.kind.name: r.kind for r in scene.robots}, scene,
+                 bodies_of(scene), np.stack(starts),
+                 grounds=tuple(standing) if len(made) > 1 else ())
 
 
 def placements(mission: Mission, frame: Frame, kinds: Sequence[RobotKind]) -> list[Placement]:

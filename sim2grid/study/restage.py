@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
 
 from moonteam import files
 from moonteam.errors import InputError, meant
+from moonteam.physics.scene import build_scene
 from moonteam.problem import mission as missions
 from sim2grid.clock.execution import TimedExecution
 from sim2grid.clock.prepare import by_the_clock, execution_of
@@ -23,7 +24,7 @@ from sim2grid.loop.execution import Execution
 from sim2grid.loop.prepare import Prepared, prepare
 from sim2grid.measure.metrics import GridPlan
 from sim2grid.study.evaluation import Contender, Entry, Row, chooser, maker, on_grid
-from sim2grid.study.fleet import fleet_of
+from sim2grid.study.fleet import fleet_of, placements
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ def restage(report: dict[str, Any], number: int, source: object,
     if chosen.mode == "clock":
         prepared = prepare(by_the_clock(mission, source), source)
         timed = execution_of(prepared, chooser(chosen), row.seed)
-        return Staged(chosen, prepared, timed, None, row, width)
-    prepared = prepare(mission, source)
+        return Staged(chosen, _among(report, prepared), timed, None, row, width)
+    prepared = _among(report, prepare(mission, source))
     make = maker(chosen)
     mission = prepared.mission
     fleet = fleet_of([mission], [1], prepared.site, prepared.passable,
@@ -85,6 +86,17 @@ def restage(report: dict[str, Any], number: int, source: object,
     execution = Execution(mission, prepared.scenario, make(), prepared.bodies, prepared.frame,
                           seed=row.seed, mode=chosen.mode, route=route)
     return Staged(chosen, prepared, execution, grid.plan, row, width)
+
+
+def _among(report: dict[str, Any], prepared: Prepared) -> Prepared:
+    """The same with a scene of several grounds, where the report's had: another program than that
+    of one ground, and not the same to the last bit.
+    """
+    if report["options"].get("sites", 1) == 1:
+        return prepared
+    scene = build_scene([prepared.site] * 2, placements(
+        prepared.mission, prepared.frame, [robot.kind for robot in prepared.scene.robots]))
+    return replace(prepared, scene=scene)
 
 
 def _contender(report: dict[str, Any], name: str | None, source: object) -> Contender:

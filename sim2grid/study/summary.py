@@ -37,10 +37,13 @@ def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence
     """The whole report, plain values only. `rows` as `Evaluation.sorted_rows` gives them."""
     groups: dict[tuple[str, int, str], list[Row]] = {}
     for row in rows:
-        groups.setdefault((row.site, row.site_seed, row.contender), []).append(row)
+        seed_of = first_seed(options, row.site_seed)
+        groups.setdefault((row.site, seed_of, row.contender), []).append(row)
     by_name = {contender.name: contender for contender in contenders}
     used = {key: group for key, group in groups.items() if key[2] in by_name}
-    heads = {key: {"site": key[0], "site_seed": key[1], "contender": key[2]} for key in used}
+    many = {"sites": options["sites"]} if "sites" in options else {}
+    heads = {key: {"site": key[0], "site_seed": key[1], **many, "contender": key[2]}
+             for key in used}
     return {
         "kind": "execution",
         "title": "executions in physics",
@@ -49,13 +52,18 @@ def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence
         "contenders": [{"name": c.name, **msgspec.to_builtins(c)} for c in contenders],
         "summary": [heads[key] | _about(by_name[key[2]]) | summarise(group, seed)
                     for key, group in used.items()],
-        "comparisons": compare(used, by_name, seed),
+        "comparisons": [line | many for line in compare(used, by_name, seed)],
         "differences": differences(used, by_name),
         "failures": [heads[key] | {"causes": failures(group)} for key, group in used.items()],
         "notes": notes(options),
         "missions": [msgspec.to_builtins(entry) for entry in entries],
         "rows": [msgspec.to_builtins(row) for row in rows if row.contender in by_name],
     }
+
+
+def first_seed(options: dict[str, Any], site_seed: int) -> int:
+    """The seed of the first of the sites whose missions stand in one line."""
+    return int(options["site_seed"]) if options.get("sites", 1) > 1 else site_seed
 
 
 def _about(contender: Contender) -> dict[str, str]:
@@ -210,7 +218,7 @@ def differences(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str
             twin = before.get(row.number)
             if twin is None or _course(row) == _course(twin):
                 continue
-            found.append({"site": site, "site_seed": site_seed, "number": row.number,
+            found.append({"site": site, "site_seed": row.site_seed, "number": row.number,
                           "contender": name, "over": other, "this": _told(row),
                           "other": _told(twin), "why": _why(row, twin)})
     return found
@@ -271,8 +279,14 @@ DIFFERENT = ["site", "mission", "contender", "went", "over", "which went", "what
 
 
 def where(line: dict[str, Any]) -> str:
-    """The ground of a line: preset or model with its seed; nothing of missions that were given."""
-    return line["site"] if line["site"] == GIVEN else f"{line['site']} {line['site_seed']}"
+    """The ground of a line: preset or model with its seed, or the first and last of many; nothing
+    of missions that were given.
+    """
+    if line["site"] == GIVEN:
+        return line["site"]
+    first = line["site_seed"]
+    last = first + line.get("sites", 1) - 1
+    return f"{line['site']} {first}" + (f" to {last}" if last > first else "")
 
 
 def tables(report: dict[str, Any]) -> list[Plain]:

@@ -84,26 +84,29 @@ class Fused:
             round(most / rules.chunk_s))
         self._programs: dict[Any, jax.stages.Compiled] = {}
 
-    def run(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any = None
-            ) -> Outcome:
-        """Runs missions from qpos `starts` [nq] or [B, nq] to their ends."""
-        arguments = self._arguments(missions, starts, params)
+    def run(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any = None,
+            grounds: Sequence[int] = ()) -> Outcome:
+        """Runs missions from qpos `starts` [nq] or [B, nq] to their ends.
+
+        `grounds` [B]: the ground of each, where the backend's scene has several.
+        """
+        arguments = self._arguments(missions, starts, params, grounds)
         return self._program(arguments)(*arguments)
 
-    def compile(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any = None
-                ) -> float:
+    def compile(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any = None,
+                grounds: Sequence[int] = ()) -> float:
         """Compiles for missions of that size; returns the seconds it took."""
         begun = time.perf_counter()
-        self._program(self._arguments(missions, starts, params))
+        self._program(self._arguments(missions, starts, params, grounds))
         return time.perf_counter() - begun
 
-    def _arguments(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any
-                   ) -> tuple[Any, ...]:
+    def _arguments(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any,
+                   grounds: Sequence[int]) -> tuple[Any, ...]:
         problems, _ = scenarios.stack([scenarios.to_problem(mission) for mission in missions])
         poses = np.asarray(starts, np.float32)
         poses = np.broadcast_to(poses, (len(missions), poses.shape[-1]))
         return (self.backend.model, self.backend.ground, params, _charted(problems),
-                self.backend.reset(poses))
+                self.backend.reset(poses, len(poses), grounds or None))
 
     def _program(self, arguments: tuple[Any, ...]) -> jax.stages.Compiled:
         shapes = jax.tree.map(lambda a: (jnp.shape(a), jnp.result_type(a)), arguments[2:])

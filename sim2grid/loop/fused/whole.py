@@ -37,7 +37,8 @@ def check(execution: Execution) -> None:
 
 
 def run(executions: Sequence[Execution], backend: MjxBackend, starts: npt.NDArray, width: int,
-        finished: Callable[[int], None] = lambda index: None) -> tuple[float, float]:
+        finished: Callable[[int], None] = lambda index: None, grounds: Sequence[int] = ()
+        ) -> tuple[float, float]:
     """Fills in the record of every execution; returns seconds compiling and running.
 
     Args:
@@ -46,6 +47,7 @@ def run(executions: Sequence[Execution], backend: MjxBackend, starts: npt.NDArra
       starts: [E, nq] qpos.
       width: missions in the program at a time; the last batch is filled up with copies.
       finished: called with the number of each that is done.
+      grounds: index of the ground of each, where the backend's scene has several.
 
     Raises:
       InputError: see `check`.
@@ -61,9 +63,10 @@ def run(executions: Sequence[Execution], backend: MjxBackend, starts: npt.NDArra
         batch = [min(k, len(executions) - 1) for k in range(first, first + width)]
         scenarios = [executions[k].asked.scenario for k in batch]
         poses = starts[batch]
-        compiling += program.compile(scenarios, poses, params)
+        which = [grounds[k] for k in batch] if grounds else []
+        compiling += program.compile(scenarios, poses, params, which)
         begun = time.perf_counter()
-        outcome = program.run(scenarios, poses, params)
+        outcome = program.run(scenarios, poses, params, which)
         outcome.progress.status.block_until_ready()
         running += time.perf_counter() - begun
         for row, k in enumerate(range(first, min(first + width, len(executions)))):

@@ -54,6 +54,9 @@ class Args(Reported):
     samples: int = 129
     """elevation samples along each side of the ground, 0.25 m apart"""
 
+    sites: int = 1
+    """sites that the worlds go round, with seeds from --seed on; 1: all worlds on one ground"""
+
     seconds: float = 3.0
     """of wall clock a measurement"""
 
@@ -69,6 +72,8 @@ def run(args: Args) -> int:
     """Measures and prints; 0."""
     if min(args.worlds, default=0) < 1:
         raise InputError("--worlds", "at least one number, each at least 1")
+    if not 1 <= args.sites <= 4096:
+        raise InputError("--sites", f"{args.sites} is not allowed; 1 to 4096")
     if not 33 <= args.samples <= 1025:
         raise InputError("--samples", f"{args.samples} is not allowed; 33 to 1025")
     if min(args.threads, default=1) < 1:
@@ -78,7 +83,7 @@ def run(args: Args) -> int:
     from moonteam.physics.trials import speed
     from moonteam.report.tables import plain_markdown, print_as, save_plain
 
-    scenes = {ground: speed.own_robots(args.site, args.seed, args.samples, ground)
+    scenes = {ground: speed.own_robots(args.site, args.seed, args.samples, args.sites, ground)
               for ground in dict.fromkeys(args.ground)}
     rows = []
     for name, batch, threads in _loads(args):
@@ -112,10 +117,12 @@ def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) 
     from moonteam.report import command, provenance
     from moonteam.robots.base import CONTROL_PERIOD
 
-    model, sites = scene.model, scene.site
+    model, most = scene.model, max(len(site.boulders) for site in scene.sites)
     notes = [
-        f"Three robots (nv {model.nv}) driving on {args.site}, {args.samples} x {args.samples} "
-        f"heights, {len(sites.boulders)} boulders, physics step "
+        f"Three robots (nv {model.nv}) driving on "
+        + (f"{args.sites} sites of " if args.sites > 1 else "")
+        + f"{args.site}, {args.samples} x {args.samples} "
+        f"heights, {most} boulders, physics step "
         f"{1000 * model.opt.timestep:g} ms, controllers every {1000 * CONTROL_PERIOD:g} ms, "
         f"{args.seconds:g} s a row.",
         "Steps and real-time factor of all worlds together. CPU: processor seconds for one "
@@ -124,7 +131,7 @@ def _document(args: Args, scene: Scene, rows: list[dict], compiled: list[dict]) 
         "title": "physics speed", "command": "bench physics", "device": speed.device_name(),
         "cpus": len(os.sched_getaffinity(0)), "site": args.site, "seed": args.seed,
         "samples": args.samples, "nv": model.nv, "dt": model.opt.timestep,
-        "seconds": args.seconds, "boulders": len(sites.boulders), "rows": rows,
+        "seconds": args.seconds, "sites": args.sites, "boulders": most, "rows": rows,
         "compilation": compiled, "notes": notes,
         "meta": provenance.meta(command.line("bench physics", args), args.seed)}
 

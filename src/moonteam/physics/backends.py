@@ -20,11 +20,13 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 from mujoco.batch import Batch
 
 from moonteam import trees
 from moonteam.physics import mjx
+from moonteam.physics.grounds import Ground, Grounds, standing
 from moonteam.physics.regolith.bed import Bed
 from moonteam.physics.regolith.forces import Memory, soil_forces
 from moonteam.physics.regolith.treads import FELT_FIELDS, WIDTH, Treads, felt_of, radii
@@ -51,6 +53,7 @@ class WorldState(NamedTuple):
     control: Controls
     soil: Array  # [B, C, 4] what soil that gives way remembers of each tread: `Memory`
     felt: Array  # [B, C, 25] what treads did in the last physics step: `Felt`
+    which: Array | None = None  # [B] the scene's ground that each stands on; None: it has but one
 
 
 class Log(NamedTuple):
@@ -62,13 +65,6 @@ class Log(NamedTuple):
     treads: Array  # [B, T, C, 3] slip, sinkage m and load N, means over the interval; C = 0: rigid
 
 
-class Ground(NamedTuple):
-    """What worlds stand on, as MJX's programs take it."""
-
-    surface: Surface
-    bed: Bed | None  # None: rigid
-
-
 class Backend(Protocol):
     """An engine that advances B worlds of one scene."""
 
@@ -76,8 +72,13 @@ class Backend(Protocol):
     scene: Scene
     log_every: int
 
-    def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
-        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
+    def reset(self, qpos: np.ndarray | None = None, batch: int = 1,
+              which: npt.ArrayLike | None = None) -> WorldState:
+        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start.
+
+        `which` [B]: the ground that each stands on, by its index in `scene.sites`; the first.
+        Raises ValueError for one that is not there.
+        """
         ...
 
     def advance(
@@ -195,9 +196,10 @@ class MjxBackend:
         self._reset = jax.jit(jax.vmap(
             lambda qpos, qvel: _start_controls(scene.robots, qpos, qvel)))
 
-    def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
-        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
-        return _at_rest(self.scene, self._reset, qpos, batch)
+    def reset(self, qpos: np.ndarray | None = None, batch: int = 1,
+              which: npt.ArrayLike | None = None) -> WorldState:
+        """Worlds at rest: see `Backend`."""
+        return _at_rest(self.scene, self._reset, qpos, batch, which)
 
     def advance(
         self, state: WorldState, commands: Commands, num_control_steps: int
@@ -222,7 +224,7 @@ class MjxBackend:
     @property
     def ground(self) -> Ground:
         """The scene's, to be handed to `traced`."""
-        return Ground(self.scene.surface, self.scene.bed)
+        return self.scene.ground
 
     def _key(self, batch: int, num_control_steps: int) -> tuple[int, int]:
         _check_steps(num_control_steps, self.log_every)
@@ -246,6 +248,7 @@ class MjxBackend:
     def _control_step(self, model: mjx.Model, ground: Ground, world: WorldState,
                       commands: Commands) -> tuple[WorldState, tuple[Array, Array, Array]]:
         """One control step of one world; a diverged world stays as it is."""
+        ground = ground.under(world.which)
         ctrl, controls, power, propellant = _call_controllers(
             self.scene.robots, self.scene.model.nu, ground.surface, world.time, world.qpos,
             world.qvel, world.control, commands)
@@ -255,6 +258,8 @@ class MjxBackend:
             data = self._blank.replace(
                 time=world.time, qpos=world.qpos, qvel=world.qvel, act=world.act,
                 qacc_warmstart=world.warmstart, ctrl=ctrl)
+            if ground.rocks is not None and world.which is not None:
+                model = ground.rocks.model(model, world.which)
             if ground.bed is not None:
                 forces, size, soil, told = _soil(ground.bed, ground.surface, soil, world.felt)
                 data = data.replace(xfrc_applied=data.xfrc_applied.at[treads.bodies].add(forces))
@@ -264,7 +269,7 @@ class MjxBackend:
             felt = world.felt if ground.bed is None else treads.felt(data, jnp)
         bad = _bad(data.qpos, data.qvel)
         moved = WorldState(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart,
-                           jnp.zeros((), bool), controls, soil, felt)
+                           jnp.zeros((), bool), controls, soil, felt, world.which)
         stopped = world._replace(qvel=jnp.zeros_like(world.qvel), diverged=jnp.ones((), bool))
         frozen = world.diverged | bad
         spent = (power, propellant, told)
@@ -272,14 +277,15 @@ class MjxBackend:
                 trees.where(frozen, jax.tree.map(jnp.zeros_like, spent), spent))
 
 
-def _control_world(scene: Scene, memories: Any, orders: Any, ground: Ground, seen: Array,
-                   memory: Array, told: Array) -> tuple[Array, Array]:
+def _control_world(scene: Scene, memories: Any, orders: Any, ground: Ground, which: Array | None,
+                   seen: Array, memory: Array, told: Array) -> tuple[Array, Array]:
     """One world: seen [1 + nq + nv + C WIDTH], the memory of controllers and soil and the commands
     side by side, which have the shapes of `memories` and `orders`.
 
     Returns ctrl, power, propellant, what is told of the treads, the soil's forces and the treads'
     radii side by side [nu + 2 R + (3 + 6 + 1) C], and the new memory.
     """
+    ground = ground.under(which)
     nq, nv = scene.model.nq, scene.model.nv
     now, qpos, qvel, felt = jnp.split(seen, (1, 1 + nq, 1 + nq + nv))
     before, soil = _shaped(memories, memory)
@@ -312,7 +318,7 @@ class NativeBackend:
         self._substeps = _substeps(scene)
         self._batch: Batch | None = None
         self._cpu = jax.local_devices(backend="cpu")[0]
-        self._ground = jax.device_put(Ground(scene.surface, scene.bed), self._cpu)
+        self._ground = jax.device_put(scene.ground, self._cpu)
         start = partial(_start_controls, scene.robots)
         model = scene.model
         self._memory = jax.eval_shape(
@@ -324,13 +330,14 @@ class NativeBackend:
         self._controllers = jax.jit(
             # Not a method: the engine would hold itself until the garbage collector comes by.
             jax.vmap(partial(_control_world, scene, self._memory, self._told),
-                     in_axes=(None, 0, 0, 0)),
+                     in_axes=(None, 0, 0, 0, 0)),
             compiler_options=in_order())
 
-    def reset(self, qpos: np.ndarray | None = None, batch: int = 1) -> WorldState:
-        """Worlds at rest: at qpos [B, nq], or `batch` copies of the scene's start."""
+    def reset(self, qpos: np.ndarray | None = None, batch: int = 1,
+              which: npt.ArrayLike | None = None) -> WorldState:
+        """Worlds at rest: see `Backend`."""
         with jax.default_device(self._cpu):
-            return _at_rest(self.scene, self._reset, qpos, batch)
+            return _at_rest(self.scene, self._reset, qpos, batch, which)
 
     def advance(
         self, state: WorldState, commands: Commands, num_control_steps: int
@@ -341,15 +348,15 @@ class NativeBackend:
         """
         _check_steps(num_control_steps, self.log_every)
         batch, nu = state.qpos.shape[0], self.scene.model.nu
-        worlds = _Worlds(self._pool(batch), state, self.scene.treads)
-        told, memory = _flat(commands, batch), self._remember(state, batch)
+        worlds = _Worlds(self._pool(batch), state, self.scene.treads, self.scene.grounds)
+        told, memory, which = _flat(commands, batch), *self._remember(state, batch)
         samples = num_control_steps // self.log_every
         num_treads = len(self.scene.treads.geoms)
         logged = 2 * len(self.scene.robots) + 3 * num_treads
         qpos = np.empty((batch, samples, self.scene.model.nq), np.float32)
         costs = np.zeros((batch, samples, logged), np.float32)
         for step in range(num_control_steps):
-            out, memory = self._controllers(self._ground, worlds.seen(), memory, told)
+            out, memory = self._controllers(self._ground, which, worlds.seen(), memory, told)
             rows = np.asarray(out)
             begun = time.perf_counter()
             worlds.step(rows[:, :nu], rows[:, nu + logged:], self._substeps)
@@ -367,18 +374,18 @@ class NativeBackend:
         """Compiles the controllers for B worlds; returns the seconds it took."""
         _check_steps(num_control_steps, self.log_every)
         state = self.reset(batch=batch)
-        worlds = _Worlds(self._pool(batch), state, self.scene.treads)
+        worlds = _Worlds(self._pool(batch), state, self.scene.treads, self.scene.grounds)
         begun = time.perf_counter()
+        memory, which = self._remember(state, batch)
         jax.block_until_ready(self._controllers(
-            self._ground, worlds.seen(), self._remember(state, batch),
-            _flat(hold(self.scene, batch), batch)))
+            self._ground, which, worlds.seen(), memory, _flat(hold(self.scene, batch), batch)))
         return time.perf_counter() - begun
 
-    def _remember(self, state: WorldState, batch: int) -> Array:
+    def _remember(self, state: WorldState, batch: int) -> tuple[Array, Array | None]:
         """The memory of controllers and soil [B, n] where the next one will be, lest jit compile
-        twice.
+        twice, and the worlds' grounds.
         """
-        return jax.device_put(_flat((state.control, state.soil), batch), self._cpu)
+        return jax.device_put((_flat((state.control, state.soil), batch), state.which), self._cpu)
 
     def _pool(self, batch: int) -> Batch:
         if self._batch is None or self._batch.nsim != batch:
@@ -423,8 +430,11 @@ def _shaped(like: Any, rows: Any) -> Any:
 class _Worlds:
     """The rows of a batch while they are advanced, with the guard against divergence."""
 
-    def __init__(self, batch: Batch, state: WorldState, treads: Treads):
-        self._batch, self._treads = batch, treads
+    def __init__(self, batch: Batch, state: WorldState, treads: Treads, grounds: Grounds | None):
+        self._batch, self._treads, self._which = batch, treads, state.which
+        if grounds is not None:
+            for name, values in grounds.fields.items():
+                batch.expand(name)[:, grounds.geoms] = values[np.asarray(state.which)]
         self._time, self.qpos = batch.bind("time"), batch.bind("qpos")
         self._qvel, self._act = batch.bind("qvel"), batch.bind("act")
         self._warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
@@ -490,10 +500,11 @@ class _Worlds:
         gone: Any = self.diverged
         return WorldState(single(self._time), single(self.qpos), single(self._qvel),
                           single(self._act), single(self._warmstart), gone, controls, soil,
-                          single(self._felt))
+                          single(self._felt), self._which)
 
 
-def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> WorldState:
+def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int,
+             which: npt.ArrayLike | None) -> WorldState:
     places = np.tile(scene.qpos0, (batch, 1)) if qpos is None else np.asarray(qpos)
     size, model = len(places), scene.model
     held = jnp.asarray(places, jnp.float32)
@@ -501,4 +512,5 @@ def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int) -> W
     return WorldState(jnp.zeros(size), held, still, jnp.zeros((size, model.na)), still,
                       jnp.zeros(size, bool), _strong(start(held, still)),
                       jnp.zeros((size, len(scene.treads.geoms), 4)),
-                      jnp.zeros((size, len(scene.treads.geoms), WIDTH)))
+                      jnp.zeros((size, len(scene.treads.geoms), WIDTH)),
+                      standing(scene.grounds, size, which))

@@ -17,11 +17,20 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.physics import mjx
+from moonteam.physics.grounds import (
+    PARKED,
+    PARKED_RADIUS,
+    Ground,
+    Grounds,
+    check_alike,
+    hfield_name,
+    make_grounds,
+)
 from moonteam.physics.regolith import treads
 from moonteam.physics.regolith.bed import Bed
 from moonteam.physics.regolith.treads import Treads
 from moonteam.robots.base import GRAVITY, PHYSICS_DT, RobotKind
-from moonteam.terrain.site import Boulder, Site
+from moonteam.terrain.site import Site
 from moonteam.terrain.surface import Surface
 
 FRICTION = 0.75
@@ -57,7 +66,10 @@ class SceneRobot:
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled model with all that the backends and the renderer need to know about it."""
+    """A compiled model with all that the backends and the renderer need to know about it.
+
+    Where worlds stand on different sites, these are `grounds`, and site and surface the first's.
+    """
 
     model: mujoco.MjModel
     robots: tuple[SceneRobot, ...]
@@ -67,10 +79,21 @@ class Scene:
     spec: mujoco.MjSpec  # what the model was compiled from
     bed: Bed | None = None  # ground that gives way, and
     treads: Treads = NO_TREADS  # which wheels and feet feel it
+    grounds: Grounds | None = None  # None: one
+
+    @property
+    def ground(self) -> Ground:
+        """What its worlds stand on."""
+        return Ground(self.surface, self.bed) if self.grounds is None else self.grounds.ground
+
+    @property
+    def sites(self) -> tuple[Site, ...]:
+        """Those that a world can stand on, by index."""
+        return (self.site,) if self.grounds is None else self.grounds.sites
 
 
 def build_scene(
-    site: Site,
+    site: Site | Sequence[Site],
     placements: Sequence[Placement],
     *,
     dt: float = PHYSICS_DT,
@@ -81,8 +104,9 @@ def build_scene(
     """Compiles a site and robots into a scene.
 
     Args:
-      site: the ground.
-      placements: the robots, with names that differ.
+      site: the ground; or several with the same grid, one of which each world then stands on.
+      placements: the robots, with names that differ, as they start on the first site. For their
+        starts on another see `start_pose`.
       dt: physics step, s.
       iterations: most Newton iterations of the contact solver a step; mostly it takes one, but
         a skidding wheel can need six, and cut short at four a robot drifted 4 cm in 5 s.
@@ -91,34 +115,37 @@ def build_scene(
 
     Raises:
       InputError: a start that cannot be: off the site, in a boulder, on too steep ground, on
-        top of another robot.
+        top of another robot; sites that are unlike.
     """
+    sites = (site,) if isinstance(site, Site) else tuple(site)
+    site = sites[0]
+    check_alike(sites)
     check_starts(site, placements)
     spec = mujoco.MjSpec()
     _set_options(spec, dt, iterations, ls_iterations)
     _bound_contacts(spec, placements)
-    _add_ground(spec, site, friction)
-    for index, boulder in enumerate(site.boulders):
-        _add_boulder(spec, index, boulder, friction)
+    _add_ground(spec, sites, friction)
+    _add_boulders(spec, sites, friction)
     for placement in placements:
         robot, prefix = placement.kind.load(), placement.name + "/"
         felt = treads.mark(robot) if site.soil else []
         spec.worldbody.add_frame().attach_body(robot.body(placement.kind.base), prefix, "")
         treads.add_sensors(spec, prefix, felt)
     model = spec.compile()
-    set_heights(model, site.heights)
+    for index, one in enumerate(sites):
+        set_heights(model, one.heights, index)
     check_collisions(model)
     robots = tuple(_find_robot(model, placement) for placement in placements)
     qpos0 = model.qpos0.copy()
     for robot, placement in zip(robots, placements, strict=True):
         qpos0[robot.qpos] = start_pose(site, placement)
     # model.qpos0 stays: it is where joint angles are measured from, not only a start.
-    if site.soil is None:
-        return Scene(model, robots, site.surface, site, qpos0, spec)
     named = [(placement.name + "/", placement.kind) for placement in placements]
-    found = treads.find(model, named)
-    bed = treads.bed_for(site.soil, model, found, named)
-    return Scene(model, robots, site.surface, site, qpos0, spec, bed, found)
+    found = treads.find(model, named) if site.soil else NO_TREADS
+    beds = [treads.bed_for(one.soil, model, found, named) for one in sites if one.soil]
+    grounds = make_grounds(model, sites, beds) if len(sites) > 1 else None
+    return Scene(model, robots, site.surface, site, qpos0, spec, beds[0] if beds else None, found,
+                 grounds)
 
 
 def start_pose(site: Site, placement: Placement) -> np.ndarray:
@@ -210,13 +237,17 @@ def _bound_contacts(spec: mujoco.MjSpec, placements: Sequence[Placement]) -> Non
     spec.add_numeric(name="max_contact_points", data=[max(contacts, 8)])
 
 
-def _add_ground(spec: mujoco.MjSpec, site: Site, friction: float) -> None:
+def _add_ground(spec: mujoco.MjSpec, sites: Sequence[Site], friction: float) -> None:
+    """One geom, which stands on the first of the sites' height fields."""
+    site = sites[0]
     rows, columns = site.heights.shape
     half_x, half_y = site.extent
     low = float(site.heights.min())
-    spec.add_hfield(name="ground", nrow=rows, ncol=columns,
-                    size=[half_x, half_y, vertical_range(site.heights), 1.0],
-                    userdata=np.zeros(rows * columns))
+    # One scale for all: engines take a geom's bounds, and MJX the scale itself, from the first.
+    scale = max(vertical_range(one.heights) for one in sites)
+    for index in range(len(sites)):
+        spec.add_hfield(name=hfield_name(index), nrow=rows, ncol=columns,
+                        size=[half_x, half_y, scale, 1.0], userdata=np.zeros(rows * columns))
     spec.worldbody.add_geom(
         name="ground", type=GEOM.mjGEOM_HFIELD, hfieldname="ground", pos=[0, 0, low],
         # Where soil gives way the contact carries the weight, and the soil does the rest.
@@ -232,21 +263,27 @@ def vertical_range(heights: np.ndarray) -> float:
     return float(2.0 ** math.ceil(math.log2(max(1.0, float(np.ptp(heights))))))
 
 
-def set_heights(model: mujoco.MjModel, heights: np.ndarray) -> None:
-    """Writes a site's elevations [ny, nx] m into a compiled scene.
+def set_heights(model: mujoco.MjModel, heights: np.ndarray, index: int = 0) -> None:
+    """Writes a site's elevations [ny, nx] m into a compiled scene, that of the first or another.
 
     The compiler itself would stretch them to the full scale.
     """
-    scaled = (heights.astype(np.float64) - float(heights.min())) / vertical_range(heights)
-    first = int(model.hfield_adr[model.hfield("ground").id])
+    field = model.hfield(hfield_name(index)).id
+    scaled = (heights.astype(np.float64) - float(heights.min())) / model.hfield_size[field, 2]
+    first = int(model.hfield_adr[field])
     model.hfield_data[first:first + scaled.size] = scaled.astype(np.float32).ravel()
 
 
-def _add_boulder(spec: mujoco.MjSpec, index: int, boulder: Boulder, friction: float) -> None:
-    spec.worldbody.add_geom(
-        name=f"boulder{index}", type=GEOM.mjGEOM_SPHERE, size=[boulder.radius, 0, 0],
-        pos=boulder.centre, contype=3, conaffinity=0, condim=3, priority=1,
-        friction=[friction, 0.005, 0.0001], group=3)
+def _add_boulders(spec: mujoco.MjSpec, sites: Sequence[Site], friction: float) -> None:
+    """Those of the first site, and parked ones for sites that have more."""
+    boulders = [(boulder.centre, boulder.radius) for boulder in sites[0].boulders]
+    more = max(len(site.boulders) for site in sites) - len(boulders)
+    parked = [(np.array([0.0, 0.0, PARKED]), PARKED_RADIUS)] * more
+    for index, (centre, radius) in enumerate(boulders + parked):
+        spec.worldbody.add_geom(
+            name=f"boulder{index}", type=GEOM.mjGEOM_SPHERE, size=[radius, 0, 0],
+            pos=centre, contype=3, conaffinity=0, condim=3, priority=1,
+            friction=[friction, 0.005, 0.0001], group=3)
 
 
 def _find_robot(model: mujoco.MjModel, placement: Placement) -> SceneRobot:

@@ -154,9 +154,9 @@ class RobotKind:
 def paces_of(name: str) -> dict[str, Pace]:
     """The bundled paces of a kind by soil, as `moonteam evaluate paces` has measured them."""
     soils = files.read_json(assets() / "robots" / "paces.json")["soils"]
-    return {soil: Pace(*(tuple(x) if isinstance(x, list) else x
-                         for x in by_kind[name]["pace"].values()))
-            for soil, by_kind in soils.items() if name in by_kind}
+    found = {soil: by_kind[name]["pace"] for soil, by_kind in soils.items() if name in by_kind}
+    return {soil: Pace(its["speed"], its["max_slope"], its["slowing"], tuple(its["slopes"]),
+                       tuple(its["slip"]), tuple(its["energy"])) for soil, its in found.items()}
 
 
 def times(matrix: Array, vector: Array) -> Array:

@@ -19,17 +19,21 @@ from jax import Array
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Surface:
-    """Elevation samples [ny, nx] in metres, `spacing` metres apart."""
+    """Elevation samples [ny, nx] in metres, `spacing` metres apart.
+
+    With `which`, heights and tops are those of G sites [G, ny, nx], of which it is that one.
+    """
 
     heights: Array  # [ny, nx] m, float32
     spacing: float = field(metadata={"static": True})  # m
     tops: Array | None = None  # [ny, nx] m, ground or the boulder above it; None: no boulders
     soft: bool = field(default=False, metadata={"static": True})  # whether wheels and feet sink in
+    which: Array | None = None  # [] index of a site
 
     @property
     def extent(self) -> tuple[float, float]:
         """Half widths (x, y) in metres."""
-        ny, nx = self.heights.shape
+        ny, nx = self.heights.shape[-2:]
         return (nx - 1) * self.spacing / 2, (ny - 1) * self.spacing / 2
 
     def height(self, xy: Array) -> Array:
@@ -69,10 +73,10 @@ class Surface:
         return (jnp.sum(around, axis=-1) + centre) / 9.0, _normal(gradient)
 
     def _triangle(self, samples: Array, xy: Array) -> tuple[Array, Array, Array]:
-        """The triangle of `samples` [ny, nx] under a point: height [...] of the square's
-        south-west corner, gradient [..., 2] and the point's offset [..., 2] m from that corner.
+        """The triangle of `samples` under a point: height [...] of the square's south-west
+        corner, gradient [..., 2] and the point's offset [..., 2] m from that corner.
         """
-        ny, nx = samples.shape
+        ny, nx = samples.shape[-2:]
         lead = (1,) * (xy.ndim - 1)
         half = jnp.array(self.extent, jnp.float32).reshape((*lead, 2))
         last = jnp.array([nx - 1, ny - 1], jnp.float32).reshape((*lead, 2))
@@ -81,8 +85,10 @@ class Surface:
         offset = at - cell
         fx, fy = offset[..., 0], offset[..., 1]
         x, y = cell[..., 0], cell[..., 1]
-        sw, se = samples[y, x], samples[y, x + 1]
-        nw, ne = samples[y + 1, x], samples[y + 1, x + 1]
+        # Samples of one site among many are never cut out of them: that would copy them all.
+        site = () if self.which is None else (self.which,)
+        sw, se = samples[*site, y, x], samples[*site, y, x + 1]
+        nw, ne = samples[*site, y + 1, x], samples[*site, y + 1, x + 1]
         south = fx >= fy  # the triangle south-west, south-east, north-east
         gx = jnp.where(south, se - sw, ne - nw)
         gy = jnp.where(south, ne - se, nw - sw)

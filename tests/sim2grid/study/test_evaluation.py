@@ -15,6 +15,7 @@ import pytest
 
 from moonteam.cli import main
 from moonteam.errors import InputError
+from moonteam.physics.backends import make_backend
 from moonteam.planners.kind import PlannerOptions
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.study import evaluation
@@ -403,6 +404,28 @@ def test_on_the_engine_a_mission_does_not_depend_on_its_company():
                        rows={(row.contender, row.number): row for row in rows[:2]})
     alone.run()
     assert alone.sorted_rows()[2] == rows[2]
+
+
+def test_missions_on_several_sites_stand_in_one_line_and_each_can_be_repeated(capsys, tmp_path):
+    words = ["evaluate", "execution", "--site", "highland", "--sites", "2", "--site-seed", "3",
+             "--side", "6", "--targets", "1", "--count", "4", "--width", "4", "--planner", "exact"]
+    assert main([*words, "--out", str(tmp_path / "mixed"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [row["site_seed"] for row in report["rows"]] == [3, 4, 3, 4]
+    (line,) = report["summary"]
+    assert (line["site_seed"], line["sites"], line["missions"]) == (3, 2, 4)
+    assert "highland 3 to 4" in (tmp_path / "mixed" / "table.md").read_text()
+    staged = restage(report, 1, "report.json")
+    staged.run(make_backend("native", staged.prepared.scene))
+    assert staged.execution.record.seconds() == pytest.approx(staged.row.report.seconds)
+    assert len(staged.execution.record.decisions) == staged.row.report.decisions
+
+
+def test_many_sites_are_for_presets(capsys, tmp_path):
+    heights = tmp_path / "flat.npy"
+    np.save(heights, np.zeros((64, 64)))
+    assert main(["evaluate", "execution", "--sites", "2", "--dem", str(heights)]) == 2
+    assert "--sites" in capsys.readouterr().err
 
 
 @pytest.mark.soak

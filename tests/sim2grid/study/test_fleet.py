@@ -144,7 +144,7 @@ def outside(tmp_path_factory):
 
 def test_missions_of_an_outside_team_stand_on_outside_ground(outside):
     fleet = make_fleet(outside, 3)
-    assert fleet.place == ("wall", 0)
+    assert fleet.place_of(0) == ("wall", 0)
     assert set(fleet.passable) == {"scout", "drone"}
     assert fleet.passable["drone"].all()
     assert not fleet.passable["scout"][:, :2].any()  # the wall
@@ -193,5 +193,18 @@ def test_a_mission_that_is_given_is_a_fleet_of_one():
     fleet = make_fleet(Given("demo"), 1)
     alone = prepare(fleet.entry(0), "demo")
     assert fleet.missions == (alone.mission,)
-    assert (fleet.place, fleet.draws) == (("missions", 0), (0,))
+    assert (fleet.place_of(0), fleet.draws) == (("missions", 0), (0,))
     np.testing.assert_array_equal(fleet.starts, alone.scene.qpos0[None])
+
+
+def test_missions_go_round_sites_as_each_site_alone_has_them():
+    mixed = make_fleet(msgspec_replace(RECIPE, sites=2), 4)
+    assert mixed.grounds == (0, 1, 0, 1)
+    assert [mixed.place_of(k) for k in range(4)] == [("highland", 3), ("highland", 4)] * 2
+    for seed in (3, 4):
+        alone = make_fleet(msgspec_replace(RECIPE, site_seed=seed), 2)
+        rows = [k for k in range(4) if mixed.place_of(k)[1] == seed]
+        assert tuple(mixed.missions[k] for k in rows) == alone.missions
+        assert tuple(mixed.scenarios[k] for k in rows) == alone.scenarios
+        np.testing.assert_array_equal(mixed.starts[rows], alone.starts)
+        assert all((mixed.site_of(k).heights == alone.site.heights).all() for k in rows)

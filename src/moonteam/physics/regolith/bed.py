@@ -43,7 +43,10 @@ DEEPEST = 0.45
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Bed:
-    """What the soil knows of the treads of a scene; arrays, so that scenes share programs."""
+    """What the soil knows of the treads of a scene; arrays, so that scenes share programs.
+
+    With `which`, the table is that of G soils [G, C, L, S, 4], of which it is that one.
+    """
 
     table: Array  # [C, L, S, 4] thrust, resistance, torque as shares of the load; sinkage m
     nominal: Array  # [C] N, the load in the middle of the grid
@@ -52,6 +55,7 @@ class Bed:
     tip: Array  # [C] m, at which it shears the soil
     axis: Array  # [C, 3] of the wheel in its body; zero for a foot
     rolls: Array  # [C] 1 for wheels, 0 for feet
+    which: Array | None = None  # [] index of a soil
 
 
 def bed_of(soil: Soil, treads: Sequence[Tread], tips: Floats, axes: Floats, loads: Floats) -> Bed:

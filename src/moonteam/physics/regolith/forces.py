@@ -132,14 +132,14 @@ def _frame(bed: Bed, felt: Felt, normal: Array) -> tuple[Array, Array, Array]:
 
 def _looked_up(bed: Bed, load: Array, slip: Array) -> tuple[Array, Array, Array, Array]:
     """The table at loads [C] and slips [C], linear in slip and in the load's logarithm."""
-    _, loads, slips, _ = bed.table.shape
+    loads, slips = bed.table.shape[-3:-1]
     at = jnp.log(jnp.maximum(load, 1e-6) / bed.nominal) / STEP + 0.5 * (loads - 1)
     row, row_part = _between(at, loads)
     column, column_part = _between(slip * (slips - 1), slips)
-    which = jnp.arange(len(load))
+    which = (*(() if bed.which is None else (bed.which,)), jnp.arange(len(load)))
 
     def line(r: Array) -> Array:
-        near, far = bed.table[which, r, column], bed.table[which, r, column + 1]
+        near, far = bed.table[*which, r, column], bed.table[*which, r, column + 1]
         return near + column_part[:, None] * (far - near)
 
     low, high = line(row), line(row + 1)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,25 +20,47 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from moonteam.errors import InputError
 from moonteam.physics.backends import Backend, Commands, NativeBackend, hold, make_backend
-from moonteam.physics.scene import Placement, Scene, build_scene
+from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.robots import KINDS, OWN
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind, Telemetry
-from moonteam.terrain.site import make_site, with_soil
+from moonteam.terrain.site import Site, make_site, with_soil
 from moonteam.terrain.surface import Surface
 
 SPREAD = 3.0
 """Distance between robots at the start, m."""
 
 
-def own_robots(preset: str, seed: int, samples: int, ground: str = "rigid") -> Scene:
-    """One robot of each kind of ours on a site of samples x samples at 0.25 m; `ground` as in a
-    mission.
+def own_robots(preset: str, seed: int, samples: int, sites: int = 1, ground: str = "rigid"
+               ) -> Scene:
+    """One robot of each kind of ours on a site of samples x samples at 0.25 m, or on several: the
+    first of the seeds from `seed` on where the robots can stand. `ground` as in a mission.
+
+    Raises InputError where they cannot, be it on one site in 20.
     """
-    site = make_site(preset, seed, (samples - 1) * 0.25)
-    site = with_soil(site, "nominal") if ground == "regolith" else site
-    return build_scene(site, [Placement(name, KINDS.get(name), (SPREAD * (i - 1), 0.0))
-                              for i, name in enumerate(OWN)])
+    team = _team()
+
+    def made(number: int) -> Site:
+        site = make_site(preset, number, (samples - 1) * 0.25)
+        return with_soil(site, "nominal") if ground == "regolith" else site
+
+    if sites == 1:
+        return build_scene(made(seed), team)
+    found: list[Site] = []
+    for index in range(20 * sites):
+        site = made(seed + index)
+        with suppress(InputError):
+            check_starts(site, team)
+            found.append(site)
+        if len(found) == sites:
+            return build_scene(found, team)
+    raise InputError("--sites", f"the robots can stand on {len(found)} of {20 * sites} sites only")
+
+
+def _team() -> list[Placement]:
+    return [Placement(name, KINDS.get(name), (SPREAD * (i - 1), 0.0))
+            for i, name in enumerate(OWN)]
 
 
 def drive(scene: Scene, batch: int, way: float = 1.0) -> Commands:
@@ -96,7 +119,14 @@ class _Run:
 
     def __init__(self, backend: Backend, batch: int):
         self._backend, self._count = backend, 0
-        self._state = backend.reset(batch=batch)
+        if backend.scene.grounds is None:
+            self._state = backend.reset(batch=batch)
+        else:
+            sites, team = backend.scene.sites, _team()
+            starts = np.stack([np.concatenate([start_pose(site, one) for one in team])
+                               for site in sites])
+            which = np.arange(batch) % len(sites)
+            self._state = backend.reset(starts[which], batch, which)
         self._ways = [drive(backend.scene, batch, way) for way in (1.0, -1.0)]
 
     def chunk(self) -> None:
