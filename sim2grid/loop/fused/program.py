@@ -101,7 +101,7 @@ class Fused:
         return time.perf_counter() - begun
 
     def _arguments(self, missions: Sequence[Scenario], starts: npt.ArrayLike, params: Any,
-                   grounds: Sequence[int]) -> tuple[Any, ...]:
+                   grounds: Sequence[int] = ()) -> tuple[Any, ...]:
         problems, _ = scenarios.stack([scenarios.to_problem(mission) for mission in missions])
         poses = np.asarray(starts, np.float32)
         poses = np.broadcast_to(poses, (len(missions), poses.shape[-1]))
