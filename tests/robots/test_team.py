@@ -19,6 +19,8 @@ events: [{at_decision: 4, impassable: {kind: legged, at: [1, 1]}}]
 ROVER = """
 from dataclasses import replace
 from moonteam.robots import KINDS
+from moonteam.terrain.site import make_site
+from moonteam.terrain.site import make_site
 ROVER = replace(KINDS.get("wheeled"), name="my-rover", speed=0.3)
 OTHER = replace(ROVER, speed=0.2)
 NUMBER = 3
@@ -42,7 +44,7 @@ def test_registered_kinds_are_found_by_name(write):
     mission, kinds = team.load(write())
     assert [robot.kind for robot in mission.robots] == ["drone", "wheeled"]
     assert kinds == {name: KINDS.get(name) for name in OWN}
-    assert set(team.limits(kinds)) == set(OWN)
+    assert set(team.limits(kinds, make_site("flat", 0, 12.0))) == set(OWN)
 
 
 def test_a_kind_in_a_file_beside_the_mission_goes_by_its_own_name(write, monkeypatch, tmp_path):

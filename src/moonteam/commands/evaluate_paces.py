@@ -22,7 +22,7 @@ class Args(Reported, Seeded):
     soil: paces.json in --out has both. The bundled ones are in assets/robots/paces.json.
 
     Examples:
-      moonteam evaluate paces --soil nominal --kind wheeled
+      moonteam evaluate paces --soil nominal --kind my_rover.py:ROVER
       moonteam evaluate paces --out runs/paces
     """
 

@@ -33,7 +33,7 @@ def judged(xy, tilt=0.0, diverged=False):
     route = traverse.Route((0.0, 0.0), (10.0, 0.0), 0.0)
     judge = traverse._Judge(KINDS.get("wheeled"), site(), [route])
     qpos, power, propellant, _ = log(np.asarray(xy, float), tilt)
-    judge.add(qpos, power, propellant, np.array([diverged]))
+    judge.add(qpos, power, propellant, np.zeros((*power.shape[:2], 0, 3)), np.array([diverged]))
     return judge.verdicts()[0]
 
 
