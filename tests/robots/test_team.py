@@ -7,6 +7,7 @@ import pytest
 
 from moonteam.errors import InputError
 from moonteam.robots import KINDS, OWN, team
+from moonteam.terrain.site import make_site
 
 MISSION = """
 map: {size: [8, 6]}
@@ -19,8 +20,6 @@ events: [{at_decision: 4, impassable: {kind: legged, at: [1, 1]}}]
 ROVER = """
 from dataclasses import replace
 from moonteam.robots import KINDS
-from moonteam.terrain.site import make_site
-from moonteam.terrain.site import make_site
 ROVER = replace(KINDS.get("wheeled"), name="my-rover", speed=0.3)
 OTHER = replace(ROVER, speed=0.2)
 NUMBER = 3
