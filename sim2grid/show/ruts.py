@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from moonteam.physics.regolith.treads import geom_at
 from moonteam.physics.render import Marker
 from moonteam.robots.base import Tread
 
@@ -60,7 +61,7 @@ def ruts_of(model: Any, times: Floats, qpos: npt.NDArray, treads: Mapping[str, T
     when: list[float] = []
     markers: list[Marker] = []
     for c, (site, tread) in enumerate(sites):
-        radius = float(_radius(model, site))
+        radius = float(model.geom_size[geom_at(model, site), 0])
         low = at[:, c, 2] - height(at[:, c, :2])
         down = low < radius + NEAR
         picked = _wheel(turned[:, c] * radius, down) if tread.rolls else _foot(
@@ -81,14 +82,6 @@ def _followed(model: Any, qpos: npt.NDArray, sites: list[int]) -> tuple[Floats, 
         places[t] = data.site_xpos[sites]
     joints = [int(model.body_jntadr[model.site_bodyid[s]]) for s in sites]
     return places, qpos[:, [int(model.jnt_qposadr[j]) for j in joints]]
-
-
-def _radius(model: Any, site: int) -> float:
-    """Of the sphere that a site lies about."""
-    body, place = model.site_bodyid[site], model.site_pos[site]
-    return next(model.geom_size[g, 0] for g in range(model.ngeom)
-                if model.geom_bodyid[g] == body and model.geom_contype[g] == 0
-                and model.geom_conaffinity[g] == 1 and np.allclose(model.geom_pos[g], place))
 
 
 def _wheel(rim: Floats, down: npt.NDArray[np.bool_]) -> list[int]:

@@ -71,7 +71,6 @@ def mark(robot: mujoco.MjSpec) -> list[str]:
     for geom in list(robot.geoms):
         if geom.contype == 0 and geom.conaffinity == 1:
             name = f"tread{len(names)}"
-            geom.name = geom.name or name
             geom.parent.add_site(name=name, pos=geom.pos, size=[SENSED * geom.size[0]] * 3,
                                  group=5)
             names.append(name)
@@ -94,12 +93,17 @@ def find(model: mujoco.MjModel, robots: Sequence[tuple[str, RobotKind]]) -> Trea
                 continue
             site = int(model.sensor_objid[sensor])
             body = int(model.site_bodyid[site])
-            geom = next(g for g in range(model.ngeom) if model.geom_bodyid[g] == body
-                        and model.geom_contype[g] == 0 and model.geom_conaffinity[g] == 1
-                        and np.allclose(model.geom_pos[g], model.site_pos[site]))
-            rows.append((geom, body, int(model.body_rootid[body]),
+            rows.append((geom_at(model, site), body, int(model.body_rootid[body]),
                          int(model.sensor_adr[sensor]), index))
     return Treads(*np.array(rows, np.intp).reshape(-1, 5).T)
+
+
+def geom_at(model: mujoco.MjModel, site: int) -> int:
+    """The sphere that meets the ground about which `mark` has put a site."""
+    return next(g for g in range(model.ngeom)
+                if model.geom_bodyid[g] == model.site_bodyid[site]
+                and model.geom_contype[g] == 0 and model.geom_conaffinity[g] == 1
+                and np.allclose(model.geom_pos[g], model.site_pos[site]))
 
 
 def bed_for(soil: Soil, model: mujoco.MjModel, treads: Treads,
