@@ -28,7 +28,7 @@ class Args(Reported):
 
     fit: bool = False
     """Fit the first soil to VIPER's slip and Rashid-1's sinkage again, from its own numbers on
-    (half a minute), and print what comes out instead."""
+    (some seconds), and print what comes out instead."""
 
 
 def run(args: Args) -> int:

@@ -48,7 +48,7 @@ def slip_on(shape: Shape, soil: Soil, load: float, slopes: Sequence[float]) -> F
     return np.array(out)
 
 
-def climbs(soils: Sequence[Soil], driven: bool = True) -> list[dict[str, Any]]:
+def climbs(soils: Sequence[Soil]) -> list[dict[str, Any]]:
     """A row a slope of VIPER's experiment: measured slip, by the sums for each soil, and by the
     forces in the engine for the first.
     """
@@ -57,12 +57,11 @@ def climbs(soils: Sequence[Soil], driven: bool = True) -> list[dict[str, Any]]:
                for soil in soils}
     rows = []
     for i, (degrees, slip, angle) in enumerate(zip(VIPER.degrees, VIPER.slip, angles, strict=True)):
-        row: dict[str, Any] = {"degrees": degrees, "measured": slip}
-        row["sums"] = {name: _finite(float(values[i])) for name, values in by_sums.items()}
-        if driven:
-            found, depth = climb(VIPER.shape, soils[0], VIPER.mass, VIPER.rate, angle, EARTH)
-            row |= {"engine": found, "engine_sinkage_m": depth}
-        rows.append(row)
+        found, depth = climb(VIPER.shape, soils[0], VIPER.mass, VIPER.rate, angle, EARTH)
+        rows.append({
+            "degrees": degrees, "measured": slip,
+            "sums": {name: _finite(float(values[i])) for name, values in by_sums.items()},
+            "engine": found, "engine_sinkage_m": depth})
     return rows
 
 
@@ -94,19 +93,23 @@ def legs(soils: Sequence[Soil], load: float = 50.0) -> list[dict[str, Any]]:
 
 def report(soils: Sequence[Soil]) -> dict[str, Any]:
     """All of it."""
-    return {"climb": climbs(soils), "pulls": {t.name: pulls(t, soils) for t in PULLS},
-            "legs": legs(soils),
-            "worst": worst(soils[0])}
+    climbed, pulled = climbs(soils), {test.name: pulls(test, soils) for test in PULLS}
+    return {"climb": climbed, "pulls": pulled, "legs": legs(soils),
+            "worst": _worst(climbed, pulled[RASHID.name], soils[0])}
 
 
 def worst(soil: Soil) -> dict[str, float]:
     """Largest error in slip up to 15 degrees, in the engine, and in Rashid-1's sinkage as a share
     of what was measured.
     """
-    slips = [abs(row["engine"] - row["measured"]) for row in climbs([soil])
-             if row["degrees"] < 16.0]
+    return _worst(climbs([soil]), pulls(RASHID, [soil]), soil)
+
+
+def _worst(climbed: list[dict[str, Any]], pulled: list[dict[str, Any]], soil: Soil
+           ) -> dict[str, float]:
+    slips = [abs(row["engine"] - row["measured"]) for row in climbed if row["degrees"] < 16.0]
     depths = [abs(row["sums"][soil.name]["sinkage_m"] / row["measured"]["sinkage_m"] - 1.0)
-              for row in pulls(RASHID, [soil])]
+              for row in pulled]
     return {"slip": max(slips), "sinkage_share": max(depths)}
 
 
