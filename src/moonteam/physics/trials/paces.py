@@ -11,18 +11,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.physics.backends import make_backend
-from moonteam.physics.scene import Placement, build_scene, start_pose
 from moonteam.physics.trials.slopes import LEVEL, SLOPED, incline, routes
-from moonteam.physics.trials.traverse import BEARS, LOG_EVERY, SAMPLE_SECONDS
-from moonteam.robots.base import Command, Pace, RobotKind
+from moonteam.physics.trials.traverse import BEARS, SAMPLE_SECONDS, Route, under_way
+from moonteam.robots.base import Pace, RobotKind
 from moonteam.terrain.site import Site
 from moonteam.terrain.soil import Soil
 
@@ -66,8 +63,7 @@ def measure(kind: RobotKind, soil: Soil, degrees: Sequence[float], count: int = 
     for slope in degrees:
         for way in WAYS if slope else ("level",):
             across = way == "across"
-            site = incline(slope, across, ROUGHNESS, seed)
-            site = Site(site.name, site.seed, site.heights, site.spacing, soil=soil)
+            site = replace(incline(slope, across, ROUGHNESS, seed), soil=soil)
             # Across, the plane begins behind a blend.
             begin, end = (0.0, WATCHED) if across else (-WATCHED, WATCHED)
             found.append(_drive(kind, site, slope, way, routes(way, count, rng), (begin, end),
@@ -75,19 +71,12 @@ def measure(kind: RobotKind, soil: Soil, degrees: Sequence[float], count: int = 
     return found
 
 
-def _drive(kind: RobotKind, site: Site, degrees: float, way: str, drives: Sequence[Any],
+def _drive(kind: RobotKind, site: Site, degrees: float, way: str, drives: Sequence[Route],
            watched: tuple[float, float], backend: str, threads: int) -> Drive:
-    starts = [Placement("robot", kind, r.start, r.yaw) for r in drives]
-    scene = build_scene(site, starts[:1])
-    engine = make_backend(backend, scene, log_every=LOG_EVERY, threads=threads)
-    state = engine.reset(np.stack([start_pose(site, place) for place in starts]))
-    goals = jnp.asarray(np.array([r.goal for r in drives], np.float32))
-    command = (Command(goals, jnp.full(len(drives), kind.speed), jnp.zeros(len(drives), bool)),)
     longest = PATIENCE * (SLOPED + 2 * LEVEL) / kind.speed
-    chunk = round(1.0 / SAMPLE_SECONDS) * LOG_EVERY
+    _, seconds = under_way(kind, site, drives, backend, threads)
     logs = []
-    for _ in range(math.ceil(longest)):
-        state, log = engine.advance(state, command, chunk)
+    for _, (_, log) in zip(range(math.ceil(longest)), seconds, strict=False):
         logs.append([np.asarray(part) for part in log])
         x = logs[-1][0][:, -1, 0]
         if (x < watched[0]).all() if way == "down" else (x > watched[1]).all():

@@ -9,7 +9,7 @@ Letters: B traverses, T log samples.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from moonteam.errors import InputError
-from moonteam.physics.backends import make_backend
+from moonteam.physics.backends import Log, WorldState, make_backend
 from moonteam.physics.scene import Placement, Scene, build_scene, start_pose
 from moonteam.report.intervals import wilson
 from moonteam.robots.base import CONTROL_PERIOD, Command, RobotKind
@@ -141,18 +141,11 @@ def run_traverses(
       watch: called with the simulated seconds so far.
       record: numbers of the routes whose poses are wanted.
     """
-    starts = [Placement("robot", kind, r.start, r.yaw) for r in routes]
-    scene = build_scene(site, starts[:1])
-    engine = make_backend(backend, scene, log_every=LOG_EVERY, threads=threads)
-    state = engine.reset(np.stack([start_pose(site, place) for place in starts]))
-    goals = np.array([r.goal for r in routes], np.float32)
-    command = (Command(jnp.asarray(goals), jnp.full(len(routes), kind.speed),
-                       jnp.zeros(len(routes), bool)),)
     length = max(math.dist(r.start, r.goal) for r in routes)
-    chunk = round(1.0 / SAMPLE_SECONDS) * LOG_EVERY
+    scene, seconds = under_way(kind, site, routes, backend, threads)
     judge, poses = _Judge(kind, site, routes), []
-    for _ in range(math.ceil(PATIENCE * length / kind.speed)):
-        state, log = engine.advance(state, command, chunk)
+    for _, (state, log) in zip(range(math.ceil(PATIENCE * length / kind.speed)), seconds,
+                               strict=False):
         judge.add(np.asarray(log.qpos), np.asarray(log.power), np.asarray(log.propellant_rate),
                   np.asarray(log.treads), np.asarray(state.diverged))
         poses.append(np.asarray(log.qpos)[list(record)])
@@ -163,6 +156,27 @@ def run_traverses(
     whole = np.concatenate(poses, axis=1)
     until = [round((rows[r].seconds + REST_SECONDS) / SAMPLE_SECONDS) for r in record]
     return rows, [Recording(scene, routes[r], whole[i, :until[i]]) for i, r in enumerate(record)]
+
+
+def under_way(kind: RobotKind, site: Site, routes: Sequence[Route], backend: str, threads: int
+              ) -> tuple[Scene, Iterator[tuple[WorldState, Log]]]:
+    """The scene of robots on their routes, a world each, and their worlds and log second by second,
+    for ever; arguments as of `run_traverses`.
+    """
+    starts = [Placement("robot", kind, r.start, r.yaw) for r in routes]
+    scene = build_scene(site, starts[:1])
+    engine = make_backend(backend, scene, log_every=LOG_EVERY, threads=threads)
+    goals = np.array([r.goal for r in routes], np.float32)
+    command = (Command(jnp.asarray(goals), jnp.full(len(routes), kind.speed),
+                       jnp.zeros(len(routes), bool)),)
+
+    def seconds() -> Iterator[tuple[WorldState, Log]]:
+        state = engine.reset(np.stack([start_pose(site, place) for place in starts]))
+        while True:
+            state, log = engine.advance(state, command, round(1.0 / SAMPLE_SECONDS) * LOG_EVERY)
+            yield state, log
+
+    return scene, seconds()
 
 
 class _Judge:
