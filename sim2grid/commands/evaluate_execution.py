@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from moonteam import files
 from moonteam.cluster import Cluster, cluster
-from moonteam.commands.options import Apart, Elevation, Missions, Planning, Reported, Resumable
+from moonteam.commands.options import (
+    Apart,
+    Elevation,
+    Missions,
+    Planning,
+    Reported,
+    Resumable,
+    check_soil,
+)
 from moonteam.errors import InputError
 from moonteam.problem.mission import SoilName
 from moonteam.report import command, journal
@@ -210,10 +218,7 @@ def _recipes(args: Args) -> list[Recipe]:
         raise InputError("--site", "give presets or an elevation model, not both; it has --dem")
     team, skills = parse_team(args.team) if args.team else (TEAM, ())
     rates = Rates(args.lose, args.slow, args.silent, args.new_targets, args.impassable)
-    if args.ground == "rigid":
-        for name in ("soil", "fields"):
-            if getattr(args, name) != getattr(Args(), name):
-                raise InputError(command.flag(name), "is of --ground regolith, which is not given")
+    check_soil(args)
     its: dict[str, Any] = {"seed": args.site_seed, "ground": args.ground, "soil": args.soil,
                            "fields": args.fields}
     grounds = [(site, Site(preset=site, **its)) for site in args.site]

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from moonteam.commands.options import Reported
+from moonteam.commands.options import Reported, check_soil
 from moonteam.errors import InputError
 from moonteam.files import replacing
 from moonteam.problem.mission import SoilName
@@ -82,8 +82,7 @@ def run(args: Args) -> int:
         raise InputError("--count and --sites", "must be at least 1")
     if not 1.0 <= args.length <= 200.0:
         raise InputError("--length", f"{args.length:g} m; allowed: 1 to 200")
-    if args.ground == "rigid" and args.soil != Args().soil:
-        raise InputError("--soil", "is of --ground regolith, which is not given")
+    check_soil(args)
     if args.video and not args.out:
         raise InputError("--video", "needs a folder to write into: --out DIR")
     from moonteam.compilation import call_at_once, enable_cache

@@ -21,8 +21,9 @@ import tyro
 
 from moonteam import outputs
 from moonteam.commands import refused
+from moonteam.errors import InputError
 from moonteam.problem.piece import Units
-from moonteam.report.command import Aside
+from moonteam.report.command import Aside, flag
 
 if TYPE_CHECKING:
     from moonteam.planners.kind import PlannerOptions
@@ -66,6 +67,14 @@ def keeping(args: Any, names: Sequence[str]) -> AbstractContextManager[None]:
         return nullcontext()
     return outputs.folder(args.out, names, force=args.force,
                           resume=getattr(args, "resume", None))
+
+
+def check_soil(args: Any) -> None:
+    """Raises InputError for options of regolith where the `ground` of `args` is rigid."""
+    usual = type(args)()
+    for name in ("soil", "fields"):
+        if args.ground == "rigid" and getattr(args, name, None) != getattr(usual, name, None):
+            raise InputError(flag(name), "is of --ground regolith, which is not given")
 
 
 @dataclass(frozen=True, kw_only=True)
