@@ -140,11 +140,14 @@ class Roads:
 
     @classmethod
     def over(cls, site: Site, size: tuple[int, int], cell_m: float,
-             limits: Mapping[str, Limits]) -> Roads:
-        """Over a map of `size` (W, H) cells about the site's centre, for kinds by their name."""
+             limits: Mapping[str, Limits], weights: Mapping[str, FloatMap] | None = None
+             ) -> Roads:
+        """Over a map of `size` (W, H) cells about the site's centre, for kinds by their name;
+        `weights` as of `of_slowness`.
+        """
         raster = Raster(size, cell_m)
         return cls.of_slowness(raster, {kind: slowness(site, raster, its)
-                                        for kind, its in limits.items()})
+                                        for kind, its in limits.items()}, weights)
 
     @classmethod
     def of_slowness(cls, raster: Raster, slow: Mapping[str, FloatMap],
@@ -159,13 +162,12 @@ class Roads:
     @classmethod
     def of_mission(cls, site: Site, mission: Mission, limits: Mapping[str, Limits]) -> Roads:
         """Over the mission's map; kinds of robots with a battery keep to the light as it says."""
-        raster = Raster(mission.map.size, mission.map.cell_m)
-        slow = {kind: slowness(site, raster, its) for kind, its in limits.items()}
-        if mission.sun is None or mission.sun.dark == 1.0 or not mission.powered():
-            return cls.of_slowness(raster, slow)
-        lit = lit_at(site, mission.sun.position(), raster.points(), PANEL)
-        weight = np.where(lit, 1.0, mission.sun.dark)
-        return cls.of_slowness(raster, slow, {
+        size, cell_m, sun = mission.map.size, mission.map.cell_m, mission.sun
+        if sun is None or sun.dark == 1.0 or not mission.powered():
+            return cls.over(site, size, cell_m, limits)
+        lit = lit_at(site, sun.position(), Raster(size, cell_m).points(), PANEL)
+        weight = np.where(lit, 1.0, sun.dark)
+        return cls.over(site, size, cell_m, limits, {
             mission.robots[i].kind: weight for i in mission.powered()})
 
     def passable(self, kind: str, xy: Points) -> bool:
