@@ -51,12 +51,7 @@ def expected(pace: Pace, qpos: npt.NDArray, height: Height) -> tuple[float | Non
     xy = qpos[np.isfinite(qpos).all(axis=1)][:, :2]
     if len(xy) < 2 or not pace.slopes:
         return None, None
-    # Steps too short to have a direction are left out.
-    kept = [0]
-    for i in range(1, len(xy)):
-        if np.hypot(*(xy[i] - xy[kept[-1]])) >= STRIDE:
-            kept.append(i)
-    way = xy[kept]
+    way = xy[strides(xy, STRIDE)]  # steps too short to have a direction are left out
     metres = np.hypot(*np.diff(way, axis=0).T)
     if metres.sum() < LEAST:
         return None, None
@@ -67,6 +62,17 @@ def expected(pace: Pace, qpos: npt.NDArray, height: Height) -> tuple[float | Non
     share = np.clip(np.interp(slope, pace.slopes, pace.slip), -1.0, 0.95)
     counted = np.where(share > 0.0, metres / (1.0 - share), metres * (1.0 + share)).sum()
     return float((counted - metres.sum()) / max(counted, metres.sum())), energy
+
+
+def strides(xy: npt.NDArray, least: float) -> list[int]:
+    """Indices of points xy [T, 2] m, the first one's and of each that is `least` m or more from the
+    one before it in the list.
+    """
+    kept = [0]
+    for k in range(1, len(xy)):
+        if np.hypot(*(xy[k] - xy[kept[-1]])) >= least:
+            kept.append(k)
+    return kept
 
 
 def ground_height(heights: npt.NDArray, spacing: float) -> Height:

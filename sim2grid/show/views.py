@@ -20,7 +20,7 @@ from moonteam.physics import look
 from moonteam.physics.render import Marker, framing, turn_z_to
 from moonteam.physics.stage import FAR, Caster, Line, Stage, View
 from moonteam.problem.sun import SunPosition
-from sim2grid.measure.slip import ground_height
+from sim2grid.measure.slip import ground_height, strides
 from sim2grid.show.cut import Shot
 from sim2grid.show.film import CHIP, MARGIN, SIDE, Film, Moment, Seen
 from sim2grid.show.hud import Box, Label, earth
@@ -329,10 +329,7 @@ class SceneViews:
     def _track(self, robot: int) -> tuple[npt.NDArray, Points]:
         """Times [n] s of a robot's track points, and the [n - 1, 2, 3] pieces between them."""
         xy, actor = self.film.paths[robot], self.take.actors[robot]
-        keep = [0]
-        for k in range(1, len(xy)):
-            if np.hypot(*(xy[k] - xy[keep[-1]])) >= TRACK_M:
-                keep.append(k)
+        keep = strides(xy, TRACK_M)
         points = self._on_ground(np.nan_to_num(xy[keep]))
         if actor.flies:
             points[:, 2] = np.maximum(points[:, 2], np.nan_to_num(
