@@ -105,7 +105,7 @@ class Fused:
         problems, _ = scenarios.stack([scenarios.to_problem(mission) for mission in missions])
         poses = np.asarray(starts, np.float32)
         poses = np.broadcast_to(poses, (len(missions), poses.shape[-1]))
-        return (self.backend.model, self.backend.ground, params, _charted(problems),
+        return (self.backend.model, self.backend.scene.ground, params, _charted(problems),
                 self.backend.reset(poses, len(poses), grounds or None))
 
     def _program(self, arguments: tuple[Any, ...]) -> jax.stages.Compiled:

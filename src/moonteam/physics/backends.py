@@ -28,7 +28,7 @@ from moonteam import trees
 from moonteam.physics import mjx
 from moonteam.physics.grounds import Ground, Grounds, standing
 from moonteam.physics.regolith.bed import Bed
-from moonteam.physics.regolith.forces import Memory, soil_forces
+from moonteam.physics.regolith.forces import Memory, fresh, soil_forces
 from moonteam.physics.regolith.treads import FELT_FIELDS, WIDTH, Treads, felt_of, radii
 from moonteam.physics.scene import Scene, SceneRobot
 from moonteam.robots.base import CONTROL_PERIOD, Command
@@ -51,7 +51,7 @@ class WorldState(NamedTuple):
     warmstart: Array  # [B, nv] the contact solver's last accelerations
     diverged: Array  # [B] bool: not a number or far too fast; the world is frozen since
     control: Controls
-    soil: Array  # [B, C, 4] what soil that gives way remembers of each tread: `Memory`
+    soil: Memory  # what soil that gives way remembers of each tread, leaves with leading [B]
     felt: Array  # [B, C, 25] what treads did in the last physics step: `Felt`
     which: Array | None = None  # [B] the scene's ground that each stands on; None: it has but one
 
@@ -147,15 +147,13 @@ def _call_controllers(
     return ctrl, tuple(states), jnp.stack(power), jnp.stack(propellant)
 
 
-def _soil(bed: Bed, surface: Surface, memory: Array, felt: Array
-          ) -> tuple[Array, Array, Array, Array]:
-    """Soil of one world: from memory [C, 4] and what is felt [C, WIDTH] the forces on the treads'
+def _soil(bed: Bed, surface: Surface, memory: Memory, felt: Array
+          ) -> tuple[Array, Array, Memory, Array]:
+    """Soil of one world: from its memory and what is felt [C, WIDTH] the forces on the treads'
     bodies [C, 6], the radii of their spheres [C], the new memory, and what is told of it [C, 3].
     """
-    before = Memory(memory[:, :2], memory[:, 2], memory[:, 3])
-    forces, after, told = soil_forces(bed, surface, before, felt_of(felt))
-    kept = jnp.concatenate([after.moved, after.depth[:, None], after.load[:, None]], axis=1)
-    return forces, radii(bed, after.depth), kept, jnp.stack(told, axis=1)
+    forces, memory, told = soil_forces(bed, surface, memory, felt_of(felt))
+    return forces, radii(bed, memory.depth), memory, jnp.stack(told, axis=1)
 
 
 def _bad(qpos: Array, qvel: Array) -> Array:
@@ -208,7 +206,8 @@ class MjxBackend:
         key = self._key(state.qpos.shape[0], num_control_steps)
         if key not in self._programs:
             self.compile(*key)
-        return self._programs[key](self.model, self.ground, _strong(state), _strong(commands))
+        return self._programs[key](self.model, self.scene.ground, _strong(state),
+                                   _strong(commands))
 
     def compile(self, batch: int, num_control_steps: int) -> float:
         """Compiles that size of advance; returns the seconds it took."""
@@ -217,14 +216,9 @@ class MjxBackend:
         begun = time.perf_counter()
         advance = jax.jit(self.traced, static_argnames="num_control_steps")
         self._programs[key] = advance.lower(
-            self.model, self.ground, state, commands,
+            self.model, self.scene.ground, state, commands,
             num_control_steps=num_control_steps).compile(in_order())
         return time.perf_counter() - begun
-
-    @property
-    def ground(self) -> Ground:
-        """The scene's, to be handed to `traced`."""
-        return self.scene.ground
 
     def _key(self, batch: int, num_control_steps: int) -> tuple[int, int]:
         _check_steps(num_control_steps, self.log_every)
@@ -322,7 +316,7 @@ class NativeBackend:
         start = partial(_start_controls, scene.robots)
         model = scene.model
         self._memory = jax.eval_shape(
-            lambda *a: (_strong(start(*a)), jnp.zeros((len(scene.treads.geoms), 4))),
+            lambda *a: (_strong(start(*a)), fresh(len(scene.treads.geoms))),
             jnp.zeros(model.nq), jnp.zeros(model.nv))
         self._told = jax.tree.map(lambda a: a[0], hold(scene, 1))
         self._reset = jax.jit(jax.vmap(start))
@@ -492,7 +486,7 @@ class _Worlds:
             self.qpos[bad] = before[bad]
             self._qvel[bad] = self._warmstart[bad] = 0.0
 
-    def state(self, controls: Controls, soil: Array) -> WorldState:
+    def state(self, controls: Controls, soil: Memory) -> WorldState:
         """The worlds as they now are."""
         def single(rows: np.ndarray) -> Any:
             return rows.astype(np.float32)
@@ -506,11 +500,11 @@ class _Worlds:
 def _at_rest(scene: Scene, start: Any, qpos: np.ndarray | None, batch: int,
              which: npt.ArrayLike | None) -> WorldState:
     places = np.tile(scene.qpos0, (batch, 1)) if qpos is None else np.asarray(qpos)
-    size, model = len(places), scene.model
+    size, model, num_treads = len(places), scene.model, len(scene.treads.geoms)
     held = jnp.asarray(places, jnp.float32)
     still = jnp.zeros((size, model.nv))
     return WorldState(jnp.zeros(size), held, still, jnp.zeros((size, model.na)), still,
                       jnp.zeros(size, bool), _strong(start(held, still)),
-                      jnp.zeros((size, len(scene.treads.geoms), 4)),
-                      jnp.zeros((size, len(scene.treads.geoms), WIDTH)),
+                      jax.tree.map(lambda a: jnp.zeros((size, *a.shape)), fresh(num_treads)),
+                      jnp.zeros((size, num_treads, WIDTH)),
                       standing(scene.grounds, size, which))
