@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
@@ -153,10 +154,16 @@ class RobotKind:
 
 def paces_of(name: str) -> dict[str, Pace]:
     """The bundled paces of a kind by soil, as `moonteam evaluate paces` has measured them."""
-    soils = files.read_json(assets() / "robots" / "paces.json")["soils"]
-    found = {soil: by_kind[name]["pace"] for soil, by_kind in soils.items() if name in by_kind}
+    found = {soil: by_kind[name]["pace"] for soil, by_kind in _measured().items()
+             if name in by_kind}
     return {soil: Pace(its["speed"], its["max_slope"], its["slowing"], tuple(its["slopes"]),
                        tuple(its["slip"]), tuple(its["energy"])) for soil, its in found.items()}
+
+
+@cache
+def _measured() -> dict[str, Any]:
+    """By soil and kind, read once for all kinds."""
+    return files.read_json(assets() / "robots" / "paces.json")["soils"]
 
 
 def times(matrix: Array, vector: Array) -> Array:
