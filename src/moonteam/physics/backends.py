@@ -188,7 +188,7 @@ class MjxBackend:
         self.log_every = log_every
         self._substeps = _substeps(scene)
         with jax.numpy_rank_promotion("allow"):
-            self.model = mjx.put_model(scene.model)
+            self.model = mjx.without_sensors(mjx.put_model(scene.model))
             self._blank = mjx.make_data(scene.model)
         self._programs: dict[tuple[int, int], jax.stages.Compiled] = {}
         self._reset = jax.jit(jax.vmap(
@@ -260,7 +260,9 @@ class MjxBackend:
                 model = model.replace(geom_size=model.geom_size.at[treads.geoms, 0].set(size))
             data = jax.lax.fori_loop(
                 0, self._substeps, lambda _, d: mjx.step(model, d), data)
-            felt = world.felt if ground.bed is None else treads.felt(data, jnp)
+            felt = world.felt
+            if ground.bed is not None:
+                felt = treads.felt(data, mjx.normal_forces(model, data, treads.geoms), jnp)
         bad = _bad(data.qpos, data.qvel)
         moved = WorldState(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart,
                            jnp.zeros((), bool), controls, soil, felt, world.which)
@@ -444,7 +446,7 @@ class _Worlds:
             for name in FELT_FIELDS:
                 batch.bind(name)
             # A body may have several treads.
-            self._of = (treads.bodies[:, None] == np.arange(self._forces.shape[1])).astype(float)
+            self._of = (np.arange(self._forces.shape[1])[:, None] == treads.bodies).astype(float)
 
     def seen(self) -> np.ndarray:
         """Time, qpos, qvel and what treads feel side by side [B, 1 + nq + nv + C WIDTH] in the
@@ -470,14 +472,16 @@ class _Worlds:
         count = len(self._treads.geoms)
         if count:
             forces = soil[:, :6 * count].reshape(-1, count, 6)
-            self._forces[:] = np.einsum("bcf,cn->bnf", forces, self._of)
+            np.matmul(self._of, forces, out=self._forces)
             self._sizes[:, self._treads.geoms, 0] = soil[:, 6 * count:]
         if not self.diverged.any():
             self._batch.step(nstep=substeps)
         elif not self.diverged.all():
             self._batch.step(ids=np.flatnonzero(~self.diverged), nstep=substeps)
         if count:
-            self._felt[~self.diverged] = self._treads.felt(self._batch, np)[~self.diverged]
+            loads = self._batch.sensordata[:, self._treads.sensors]
+            np.copyto(self._felt, self._treads.felt(self._batch, loads, np), casting="same_kind",
+                      where=~self.diverged[:, None, None])
         # Not a number makes this comparison false, too.
         bad = ~(np.abs(self._qvel).max(axis=1) <= MAX_SPEED)
         bad |= ~np.isfinite(self.qpos).all(axis=1)

@@ -2,11 +2,13 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from moonteam.physics import mjx
 from moonteam.physics.backends import hold, make_backend
 from moonteam.physics.regolith import wheel
 from moonteam.physics.scene import Placement, build_scene
@@ -129,3 +131,20 @@ def test_every_sphere_of_a_kind_that_meets_the_ground_is_a_tread(kind):
     assert scene.bed is not None
     assert scene.bed.table.shape[0] == len(meets)
     assert bool(np.asarray(scene.bed.rolls).all()) == KINDS.get(kind).tread.rolls
+
+
+def test_loads_from_the_contacts_are_those_of_the_touch_sensors():
+    scene = scene_on(0.0)
+    model, data = mjx.put_model(scene.model), mjx.make_data(scene.model)
+    data = data.replace(qpos=make_backend("mjx", scene).reset().qpos[0])
+
+    @jax.jit
+    def settled(data):
+        with jax.numpy_rank_promotion("allow"):
+            data = jax.lax.fori_loop(0, 40, lambda _, d: mjx.step(model, d), data)
+            return (data.sensordata[scene.treads.sensors],
+                    mjx.normal_forces(model, data, scene.treads.geoms))
+
+    sensed, summed = settled(data)
+    assert np.count_nonzero(sensed) >= 3
+    np.testing.assert_allclose(summed, sensed, rtol=1e-6)

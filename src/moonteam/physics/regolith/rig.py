@@ -68,7 +68,8 @@ def climb(shape: Shape, soil: Soil, mass: float, rate: float, slope: float, grav
     memory = fresh(1)
     begun, depth = np.zeros(3), []
     for tick in range(round(SECONDS / CONTROL_PERIOD)):
-        forces, size, memory, told = step(memory, treads.felt(data, np).astype(np.float32))
+        forces, size, memory, told = step(memory, treads.felt(
+            data, data.sensordata[treads.sensors], np).astype(np.float32))
         data.xfrc_applied[wheel] = forces[0]
         model.geom_size[treads.geoms[0], 0] = size[0]
         # It starts softly, as a hand would let it.

@@ -45,11 +45,13 @@ class Treads:
     sensors: Ints  # addresses in sensordata
     robots: Ints
 
-    def felt(self, data: Any, xp: Any) -> Any:
-        """Side by side [..., C, WIDTH], of the fields of MjData, MJX's or a batch's, by `xp`."""
+    def felt(self, data: Any, loads: Any, xp: Any) -> Any:
+        """Side by side [..., C, WIDTH], of the fields of MjData, MJX's or a batch's and the loads
+        [..., C] N, by `xp`.
+        """
         parts = (data.geom_xpos[..., self.geoms, :], _rows(data.xmat, 9)[..., self.bodies, :],
                  data.cvel[..., self.bodies, :], data.subtree_com[..., self.roots, :],
-                 data.xipos[..., self.bodies, :], data.sensordata[..., self.sensors, None])
+                 data.xipos[..., self.bodies, :], loads[..., None])
         return xp.concatenate(parts, axis=-1)
 
 
