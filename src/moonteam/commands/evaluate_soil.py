@@ -24,7 +24,7 @@ class Args(Reported):
     """
 
     soil: tuple[SoilName, ...] = ("nominal", "loose", "dense", "lunar", "grc1")
-    """which soils; the first is also driven in the engine"""
+    """which soils; the first is also driven in the engine, and GRC-1 shown as two have it"""
 
     fit: bool = False
     """Fit the first soil to VIPER's slip and Rashid-1's sinkage again, from its own numbers on
@@ -38,10 +38,12 @@ def run(args: Args) -> int:
     enable_cache()
     call_at_once()
     from moonteam.physics.regolith import validation
+    from moonteam.physics.regolith.published import GRC1
     from moonteam.report import command, provenance, tables
     from moonteam.terrain.soil import SOILS
 
     soils = [SOILS[name] for name in dict.fromkeys(args.soil)]
+    soils += [GRC1] if "grc1" in args.soil else []
     meta = provenance.meta(command.line("evaluate soil", args), 0)
     if args.fit:
         soil = validation.fitted(soils[0])
@@ -58,6 +60,6 @@ def run(args: Args) -> int:
     if args.out:
         tables.save_plain(args.out, "soil", report, shown)
         if not args.fit:
-            validation.draw(args.out / "soil.png", report)
+            validation.draw(args.out / "soil.png", report, soils)
     tables.print_plain(args, report, shown)
     return 0

@@ -7,9 +7,10 @@ else of theirs is used.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from moonteam.physics.regolith.wheel import Shape
+from moonteam.terrain.soil import SOILS
 
 EARTH = 9.81  # m/s^2
 
@@ -63,6 +64,12 @@ DING = Pull(
     (0.0045, 0.005, 0.0075, 0.0105, 0.014, 0.027))
 
 PULLS = (RASHID, DING)
+
+GRC1 = replace(
+    SOILS["grc1"], name="grc1 of Hu", cohesion=0.0, friction=math.atan(0.6593),
+    source="GRC-1 at 1670 kg/m^3 as uwsbel/chrono-wisc has it (friction 0.6593, no cohesion); "
+    "stiffness and K as of grc1")
+"""The same simulant by others, who disagree about its strength: shown beside `grc1`."""
 
 SPACEBOK_SLOPE = math.radians(25.0)
 """The end of the test bed, which SpaceBok climbed on soles of 110 cm^2 (arXiv 2106.01974)."""

@@ -19,7 +19,7 @@ from moonteam.physics.regolith import published, wheel
 from moonteam.physics.regolith.published import EARTH, PULLS, RASHID, VIPER, Pull
 from moonteam.physics.regolith.rig import climb
 from moonteam.physics.regolith.wheel import Shape
-from moonteam.terrain.soil import SOILS, Soil
+from moonteam.terrain.soil import Soil
 
 Floats = npt.NDArray[np.float64]
 Tables = list[tuple[list[str], list[list[str]]]]
@@ -173,6 +173,8 @@ def notes(document: dict[str, Any]) -> list[str]:
         f"First table: slip of {VIPER.name} ({VIPER.source}); by the sums along the rim for each "
         "soil, and of the first soil by the forces in the engine on a test bed. -: it slides back.",
         *(f"Then {test.name}: {test.source}." for test in PULLS),
+        *([f"{published.GRC1.name}: {published.GRC1.source}."]
+          if published.GRC1.name in document["climb"][0]["sums"] else []),
         f"Last: a sole of 110 cm2 at 50 N a foot; SpaceBok climbed 25 deg, the end of its bed, and "
         f"grousers of 12 mm gave it {100 * published.GROUSER_GAIN[0]:.0f} to "
         f"{100 * published.GROUSER_GAIN[1]:.0f} % more traction (arXiv 2106.01974).",
@@ -183,7 +185,7 @@ def notes(document: dict[str, Any]) -> list[str]:
     ]
 
 
-def draw(path: Path, document: dict[str, Any]) -> None:
+def draw(path: Path, document: dict[str, Any], soils: Sequence[Soil]) -> None:
     """Slip over slope, sinkage and pull over slip, with the published points."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -194,10 +196,10 @@ def draw(path: Path, document: dict[str, Any]) -> None:
     degrees = np.linspace(0.0, 27.0, 55)
     rows = document["pulls"][RASHID.name]
     slips = np.linspace(0.02, 0.6, 30)
-    for number, name in enumerate(document["climb"][0]["sums"]):
-        soil, color = SOILS[name], f"C{number}"
+    for number, soil in enumerate(soils):
+        color = f"C{number}"
         slip = slip_on(VIPER.shape, soil, VIPER.mass * EARTH, np.radians(degrees).tolist())
-        left.plot(degrees[slip <= 1.0], slip[slip <= 1.0], color=color, label=name)
+        left.plot(degrees[slip <= 1.0], slip[slip <= 1.0], color=color, label=soil.name)
         found = wheel.curves(RASHID.shape, soil, np.array([RASHID.load]), slips)
         middle.plot(slips, 1e3 * found.sinkage[0], color=color)
         right.plot(slips, found.pull[0] * RASHID.load, color=color)
