@@ -233,7 +233,7 @@ def test_an_interrupted_comparison_is_saved(capsys, tmp_path, monkeypatch):
     (["grid", SET, "--policy", "any_team"], "--policy: has no effect"),
     (["grid", SET, "--threads", "2"], "--threads: has no effect without a planner that takes"),
     (["grid", SET, "--planner", "lns", "--threads", "0"], "--threads: 0 is not allowed"),
-    (["grid", "3x5", "--planner", "lns", "--threads", "2"], "--threads: is for sets by the clock"),
+    (["grid", "3x5", "--planner", "exact", "--threads", "2"], "--threads: has no effect without"),
     (["replanning", SET, "--planner", "greedy"], "is by the clock"),
 ])
 def test_what_cannot_be_is_one_line(capsys, words, said):

@@ -61,6 +61,22 @@ def test_an_iteration_budget_makes_it_repeatable():
     assert np.array_equal(one.actions, two.actions)
 
 
+def test_threads_search_side_by_side_and_the_best_counts():
+    snapshot = Snapshot.start(grid.generate(1, num_agents=8, num_targets=40))
+    one, two, again = (LnsPlanner("makespan", iterations=60, seed=7, threads=t).plan(snapshot)
+                       for t in (1, 3, 3))
+    assert two.makespan <= one.makespan
+    assert np.array_equal(two.actions, again.actions)
+
+
+def test_fifty_robots_and_five_hundred_targets_are_planned_in_seconds():
+    snapshot = Snapshot.start(grid.generate(0, num_agents=50, num_targets=500))
+    plan = LnsPlanner(time_limit=1.0).plan(snapshot)
+    assert simulate.replay(snapshot, plan.actions).complete
+    assert plan.bound <= plan.makespan
+    assert plan.seconds < 10.0
+
+
 def test_no_iterations_are_the_greedy_plan():
     snapshot = Snapshot.start(grid.generate(1, num_agents=5, num_targets=20))
     none, greedy = LnsPlanner("moves", iterations=0), GreedyPlanner("moves")
@@ -84,8 +100,8 @@ def test_the_steps_left_are_kept_where_they_can_be():
 
 
 def test_too_many_agents_are_refused():
-    with pytest.raises(InputError, match="at most 30"):
-        GreedyPlanner().plan(Snapshot.start(grid.generate(0, num_agents=31)))
+    with pytest.raises(InputError, match="at most 62"):
+        GreedyPlanner().plan(Snapshot.start(grid.generate(0, num_agents=63)))
 
 
 def test_lower_bounds_hold():
@@ -109,11 +125,18 @@ def test_parts_solved_exactly_raise_the_bound():
 def test_coalitions_are_those_of_the_plain_list():
     for seed in range(20):
         task = task_of(grid.generate(seed, num_agents=5, num_targets=6, num_skills=3))
-        masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
+        teams = insertion.coalitions(task.start, task.skills, task.need, task.both)
         for t in range(len(task.targets)):
-            mine = sorted(masks[first[t]:first[t + 1]].tolist())
+            those = range(teams.first[t], teams.first[t + 1])
             plain = sorted(sum(1 << a for a in team) for team in coalitions(task, t))
-            assert mine == plain
+            assert sorted(teams.masks[those].tolist()) == plain
+            for a in range(len(task.start)):
+                place = t * len(task.start) + a
+                having = teams.having[teams.begin[place]:teams.begin[place + 1]]
+                assert sorted(having) == [c for c in those if teams.masks[c] >> a & 1]
+            for c in those:
+                members = [a for a in teams.members[c] if a >= 0]
+                assert sum(1 << int(a) for a in members) == teams.masks[c]
 
 
 def test_inserting_one_event_costs_what_the_place_said():
@@ -121,20 +144,16 @@ def test_inserting_one_event_costs_what_the_place_said():
     rng = np.random.default_rng(0)
     for seed in range(10):
         task = task_of(grid.generate(seed, num_agents=4, num_targets=8, blocked=GROUND))
-        agents, count = task.start.shape
-        masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
-        order = rng.permutation(count).astype(np.int32)
-        team = np.array([masks[rng.integers(first[t], first[t + 1])] for t in order], np.int32)
-        head, tail = np.zeros(count, np.int32), np.zeros(count, np.int32)
-        following = np.zeros((count + 1, agents), np.int32)
-        ways = (task.start, task.between, task.kinds)
-        before = insertion.measure(*ways, order[:-1].copy(), team[:-1].copy(), count - 1, head,
-                                   tail, following)
-        cost, _, place, mask = insertion.best_place(
-            int(order[-1]), *ways, order[:-1].copy(), team[:-1].copy(), count - 1, head, tail,
-            following, *before, masks, first, 1.0, 0.01, 10_000, 0.0)
-        new_order = np.insert(order[:-1], place, order[-1]).astype(np.int32)
-        new_team = np.insert(team[:-1], place, mask).astype(np.int32)
-        makespan, moves = insertion.measure(*ways, new_order, new_team, count, head, tail,
-                                            following)
+        count = len(task.targets)
+        ways = insertion.Ways(task.start, task.between, task.kinds)
+        teams = insertion.coalitions(task.start, task.skills, task.need, task.both)
+        line = insertion.empty(ways, teams)
+        line.order[:] = rng.permutation(count)
+        line.crew[:] = [rng.integers(*teams.first[t:t + 2]) for t in line.order]
+        before = insertion.measure(ways, teams, line, count - 1)
+        last = int(line.order[-1])
+        cost, _, place, crew = insertion.best_place(
+            last, ways, teams, line, count - 1, *before, 1.0, 0.01, 10_000, 0.0)
+        insertion.put(line, count - 1, place, last, crew)
+        makespan, moves = insertion.measure(ways, teams, line, count)
         assert cost == pytest.approx(makespan + 0.01 * moves)

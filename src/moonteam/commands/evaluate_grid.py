@@ -79,7 +79,7 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     """Seconds a scenario that anytime planners (exact, lns, cpsat) may take; again for
     more rows. Default: theirs."""
     threads: int = 1
-    """That lns by the clock searches with side by side."""
+    """That lns and auto search with side by side."""
 
 
 def load_any(name: str, limit: int | None) -> list[Scenario] | list[Timed]:
@@ -188,8 +188,6 @@ def _judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: s
     if clocked:
         return timed.evaluate(clocked, timed.contenders(options), seed, title, line, kept,
                               workers), timed
-    if options.threads > 1:
-        raise InputError("--threads", "is for sets by the clock")
     steps = [one for one in found if isinstance(one, Scenario)]
     return grid.evaluate(steps, contenders.contenders(options), seed, title, line, kept,
                          workers), grid

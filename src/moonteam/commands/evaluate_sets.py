@@ -94,7 +94,7 @@ def run(args: Args) -> int:
 
 
 def _bundled() -> list[str]:
-    """Names of all bundled sets in steps, small ones first; those in folders are by the clock."""
+    """Names of the bundled sets that are in no folder, small ones first: all are in steps."""
     index = msgspec.json.decode(paths.find("index", "testsets", ".json").read_bytes())
     return sorted((name for name in index if "/" not in name),
                   key=lambda name: (index[name]["targets"], index[name]["agents"]))

@@ -57,7 +57,7 @@ class Args(Planning, Saved, Printed):
     seed: int = 0
     """Seed of lns and of a policy that samples."""
     threads: int = 1
-    """That lns by the clock searches with side by side."""
+    """That lns and auto search with side by side."""
     clock: Literal["steps", "seconds"] | None = None
     """steps: one cell a decision; seconds: a mission on its ground, at any angle, each kind at its
     own speed. Default: as the file says."""
@@ -99,8 +99,12 @@ def _named(found: Scenario) -> Case:
 def make_plan(args: Args, snapshot: Snapshot) -> Plan:
     """The plan that the chosen planner makes. Raises InputError."""
     from moonteam.planners import registry
+    from moonteam.planners.kind import NO_THREADS
 
-    if registry.find(args.planner).wants_policy:
+    kind = registry.find(args.planner)
+    if args.threads > 1 and not kind.parallel:
+        raise InputError("--threads", NO_THREADS)
+    if kind.wants_policy:
         from moonteam import compilation
 
         compilation.enable_cache()
@@ -158,8 +162,6 @@ def run(args: Args) -> int:
         return clocked.run(args, timed.of(found) if isinstance(found, Scenario) else found)
     if isinstance(found, Timed) or (isinstance(found, Mission) and found.clock == "seconds"):
         raise InputError("--clock steps", f"{args.scenario} is by the clock")
-    if args.threads > 1:
-        raise InputError("--threads", "is for plans by the clock (--clock seconds)")
     case = case_of(found)
     with busy("planning; the first time on a machine it compiles for a minute"):
         plan = make_plan(args, Snapshot.start(case.scenario))

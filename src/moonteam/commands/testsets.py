@@ -31,11 +31,13 @@ class Recipe:
     skills: int = 2
     ground: tuple[float, ...] | None = None  # share of the map each kind of ours cannot enter
     certified: bool = True  # optima by the exact planner; else best known and a bound
+    folder: str = ""
 
     def name(self) -> str:
-        """File name without suffix, e.g. 3x5, 4x6-3skills, 3x6-blocked."""
-        return (f"{self.agents}x{self.targets}" + (f"-{self.skills}skills" if self.skills != 2
-                else "") + ("-blocked" if self.ground else ""))
+        """File name without suffix, e.g. 3x5, 4x6-3skills, 3x6-blocked, large/20x100."""
+        skills = f"-{self.skills}skills" if self.skills != 2 else ""
+        blocked = "-blocked" if self.ground else ""
+        return f"{self.folder}{self.agents}x{self.targets}{skills}{blocked}"
 
     @property
     def blocked(self) -> dict[str, float] | None:
@@ -52,6 +54,8 @@ RECIPES = (
     Recipe(4, 6, 200, skills=3), Recipe(5, 8, 200, skills=3),
     Recipe(3, 6, 200, ground=(0.0, 0.12, 0.25)),
     Recipe(5, 20, 100, certified=False), Recipe(8, 40, 100, certified=False),
+    Recipe(20, 100, 10, certified=False, folder="large/"),
+    Recipe(50, 500, 3, certified=False, folder="large/"),
 )
 NAMES = tuple(recipe.name() for recipe in RECIPES)
 ALL = NAMES + testsets_seconds.NAMES + testsets_unfolding.NAMES
@@ -65,7 +69,7 @@ class Args(Forced, Printed):
     Every scenario can be solved within its 128 steps; draws that cannot are drawn again.
     Optima are those of the exact planner, makespan and moves each on its own and within 128
     steps. The sets too large for it hold the best values known (large-neighbourhood search
-    with --iterations, from several starts) and lower bounds.
+    with --iterations, from several starts) and lower bounds; the largest are in the folder large.
 
     The sets in the folder seconds are by the clock: robots of unlike speeds on straight ways,
     with the least makespan in seconds. Those in the folder unfolding are missions in which not
@@ -87,7 +91,7 @@ class Args(Forced, Printed):
     """Which sets to make."""
 
     count: int | None = None
-    """Scenarios a set; default: 1000, 200 or 100 as the set asks."""
+    """Scenarios a set; default: 1000, 200, 100, 10 or 3 as the set asks."""
 
     iterations: int = 30_000
     """Large-neighbourhood iterations for each objective and start of the large sets."""

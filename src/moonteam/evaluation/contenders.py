@@ -28,7 +28,7 @@ from moonteam.planners.base import (
     check_objective,
 )
 from moonteam.planners.decode import Decode
-from moonteam.planners.kind import DEFAULT_POLICY, PlannerKind, PlannerOptions
+from moonteam.planners.kind import DEFAULT_POLICY, NO_THREADS, PlannerKind, PlannerOptions
 from moonteam.policies.brain import PointerBrain
 from moonteam.policies.policy import Policy
 from moonteam.report.journal import NOTHING, Kept
@@ -58,7 +58,7 @@ class Options:
     seed: int = 0
     alone: bool = False
     threads: int = 1
-    """That a planner by the clock may search with."""
+    """That a planner may search with, if it can."""
 
     def of(self, objective: Objective | None = None, limit: float | None = None,
            preference: float = 0.0, policy: str | Path | None = None) -> PlannerOptions:
@@ -99,12 +99,14 @@ class Planned:
     kind: str
     objective: Objective
     limit: float | None = None  # where there are rows with several
+    threads: int = 1
 
     @property
     def name(self) -> str:
         """Such as exact(makespan) or lns(makespan, 0.1 s)."""
         seconds = "" if self.limit is None else f", {self.limit:g} s"
-        return f"{self.kind}({self.objective}{seconds})"
+        threads = "" if self.threads == 1 else f", {self.threads} threads"
+        return f"{self.kind}({self.objective}{seconds}{threads})"
 
     def check(self, world: World) -> None:
         """Raises InputError, the planner's own, if a scenario has too many targets for it."""
@@ -238,6 +240,9 @@ def contenders(options: Options) -> list[Contender]:
         options.of(preference=preference)
     for text in options.decodes:
         decoding.parse(text)
+    kinds = [registry.find(planner) for planner in dict.fromkeys(options.planners)]
+    if options.threads > 1 and not any(kind.parallel for kind in kinds):
+        raise InputError("--threads", NO_THREADS)
     found: list[Contender] = []
     for planner in dict.fromkeys(options.planners):
         kind = registry.find(planner)
@@ -262,7 +267,8 @@ def _planned(planner: str, kind: PlannerKind, options: Options,
                                                     limits or [None]):
         name = kind.name + (f" {called(file)}" if file is not None and len(files) > 1 else "")
         made = registry.make(planner, options.of(objective, limit, policy=file))
-        found.append(Planned(made, name, objective, limit if len(limits) > 1 else None))
+        found.append(Planned(made, name, objective, limit if len(limits) > 1 else None,
+                             options.threads if kind.parallel else 1))
     return found
 
 

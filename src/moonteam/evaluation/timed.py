@@ -15,7 +15,7 @@ from moonteam.errors import InputError
 from moonteam.evaluation import apart
 from moonteam.evaluation.contenders import MAKESPAN, Options, policies
 from moonteam.planners.base import Objective, check_objective
-from moonteam.planners.kind import PlannerOptions
+from moonteam.planners.kind import NO_THREADS, PlannerOptions
 from moonteam.planners.seconds import base, registry
 from moonteam.planners.seconds.base import MS, Moment, TimedPlan, TimedPlanner
 from moonteam.planners.seconds.registry import TimedPlannerKind
@@ -158,7 +158,7 @@ def contenders(options: Options) -> list[Contender]:
 def _check_options(options: Options, kinds: Sequence[TimedPlannerKind]) -> None:
     """Raises InputError for options that would have no effect."""
     if options.threads > 1 and not any(kind.parallel for kind in kinds):
-        raise InputError("--threads", "has no effect without a planner that takes them: lns")
+        raise InputError("--threads", NO_THREADS)
     if any(kind.wants_policy for kind in kinds):
         return
     for option, given in (("--policy", options.policies), ("--preference", options.preferences),

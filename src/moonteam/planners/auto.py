@@ -28,16 +28,17 @@ class AutoPlanner(PlanFollower):
       beta: weight of the moves in the weighted objective.
       time_limit: seconds a plan; unless certified it depends on the machine's speed.
       seed: of local search.
+      threads: of local search.
     """
 
     name = "auto"
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
-                 time_limit: float = LIMIT, seed: int = 0):
+                 time_limit: float = LIMIT, seed: int = 0, threads: int = 1):
         super().__init__()
         self.objective: Objective = check_objective(objective, alpha, beta)
         self.alpha, self.beta = alpha, beta
-        self.time_limit, self.seed = time_limit, seed
+        self.time_limit, self.seed, self.threads = time_limit, seed, threads
 
     def reset(self, snapshot: Snapshot, seed: int = 0) -> None:
         """Starts a mission; the seed is that of local search."""
@@ -58,7 +59,8 @@ class AutoPlanner(PlanFollower):
                 return _said(first, "certified") if first.status == "optimal" else first
             why = f"{count} targets were not certified within {SHARE * self.time_limit:g} s"
         left = max(self.time_limit - (time.perf_counter() - began), 1e-3)
-        plan = LnsPlanner(*goal, time_limit=left, seed=self.seed).plan(snapshot)
+        plan = LnsPlanner(*goal, time_limit=left, seed=self.seed,
+                          threads=self.threads).plan(snapshot)
         if first is not None:
             bound = max((b for b in (first.bound, plan.bound) if b is not None), default=None)
             better = min((plan, first), key=self._value)
@@ -87,7 +89,8 @@ def _said(plan: Plan, why: str, seconds: float | None = None) -> Plan:
 
 
 def _planner(options: PlannerOptions) -> AutoPlanner:
-    return AutoPlanner(*options.goal, time_limit=options.time_limit or LIMIT, seed=options.seed)
+    return AutoPlanner(*options.goal, time_limit=options.time_limit or LIMIT, seed=options.seed,
+                       threads=options.threads)
 
 
-PLANNER = PlannerKind("auto", _planner, anytime=True)
+PLANNER = PlannerKind("auto", _planner, anytime=True, parallel=True)

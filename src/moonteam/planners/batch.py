@@ -138,47 +138,39 @@ def _drop_hopeless(start, skills, target_skills, target_and, index, count):
 
 
 @njit(cache=True, nogil=True)
-def _inserted(start, between, kinds, masks, first, alpha, beta, horizon, regret, order, team):
-    """Fills order [M] and team [M] by insertion; returns what the plan costs."""
-    n, m = start.shape
-    head, tail = np.zeros(m, np.int32), np.zeros(m, np.int32)
-    following = np.zeros((m + 1, n), np.int32)
-    _, makespan, moves = insertion.insert_all(
-        np.arange(m).astype(np.int32), regret, start, between, kinds, order, team, 0, head, tail,
-        following, masks, first, alpha, beta, horizon, 0.0)
-    return insertion.price(makespan, moves, alpha, beta, horizon)
-
-
-@njit(cache=True, nogil=True)
 def _search_near(start, between, kinds, skills, need, both, alpha, beta, horizon, iterations, seed,
                  found):
     """Insertion, then a large-neighbourhood search; fills routes `found` [N, M] and returns
     (makespan, moves).
     """
     n, m = start.shape
-    masks, first = insertion.coalitions(start, skills, need, both)
-    order, team = np.zeros(m, np.int32), np.zeros(m, np.int32)
-    cost = _inserted(start, between, kinds, masks, first, alpha, beta, horizon, True, order, team)
-    other, others = np.zeros(m, np.int32), np.zeros(m, np.int32)
-    if _inserted(start, between, kinds, masks, first, alpha, beta, horizon, False, other,
-                 others) < cost:
-        order[:], team[:] = other, others
-    best_order, best_team = order.copy(), team.copy()
+    ways = insertion.Ways(start, between, kinds)
+    teams = insertion.coalitions(start, skills, need, both)
+    line, other = insertion.empty(ways, teams), insertion.empty(ways, teams)
+    every = np.arange(m).astype(np.int32)
+    _, makespan, moves = insertion.insert_all(every.copy(), True, ways, teams, line, 0, alpha, beta,
+                                              horizon, 0.0, m)
+    cost = insertion.price(makespan, moves, alpha, beta, horizon)
+    _, makespan, moves = insertion.insert_all(every, False, ways, teams, other, 0, alpha, beta,
+                                              horizon, 0.0, m)
+    if insertion.price(makespan, moves, alpha, beta, horizon) < cost:
+        line = other
+    best_order, best_crew = line.order.copy(), line.crew.copy()
+    order, crew = line.order.copy(), line.crew.copy()
     warm = max(alpha, beta)
     for part in range(4):  # cooler and cooler
         insertion.improve(
-            start, between, kinds, masks, first, order, team, alpha, beta, alpha, beta, horizon,
-            iterations // 4, warm * 2.0 * 0.4**part, warm * 2.0 * 0.4**(part + 1), seed + part,
-            best_order, best_team)
+            ways, teams, order, crew, alpha, beta, alpha, beta, horizon, iterations // 4,
+            warm * 2.0 * 0.4**part, warm * 2.0 * 0.4**(part + 1), seed + part, best_order,
+            best_crew)
     for a in range(n):
         count = 0
         for i in range(m):
-            if best_team[i] >> a & 1:
+            if teams.masks[best_crew[i]] >> a & 1:
                 found[a, count] = best_order[i]
                 count += 1
-    head, tail = np.zeros(m, np.int32), np.zeros(m, np.int32)
-    return insertion.measure(start, between, kinds, best_order, best_team, m, head, tail,
-                             np.zeros((m + 1, n), np.int32))
+    line.order[:], line.crew[:] = best_order, best_crew
+    return insertion.measure(ways, teams, line, m)
 
 
 @njit(cache=True, nogil=True)

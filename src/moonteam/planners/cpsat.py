@@ -22,7 +22,7 @@ from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.lns import Events, Weights, best_insertion, improve, measure
 from moonteam.planners.plans.follow import Answer, RoutePlanner
-from moonteam.planners.search.insertion import coalitions
+from moonteam.planners.search.insertion import teams_of
 from moonteam.planners.search.task import Task, weights
 from moonteam.planners.search.travel import UNREACHABLE
 
@@ -124,9 +124,9 @@ class CpSatPlanner(RoutePlanner):
         arcs: dict[Arc, tuple[int, Any]] = {}
         visits = [[model.new_bool_var(f"visit{a}_{t}") for t in range(count)]
                   for a in range(agents)]
-        masks, first = coalitions(task.start, task.skills, task.need, task.both)
+        every = teams_of(task.start, task.skills, task.need, task.both)
         for t in range(count):
-            teams = masks[first[t]:first[t + 1]].tolist()
+            teams = every.masks[every.first[t]:every.first[t + 1]].tolist()
             picked = [model.new_bool_var(f"team{t}_{c}") for c in range(len(teams))]
             model.add_exactly_one(picked)
             for a in range(agents):

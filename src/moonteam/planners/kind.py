@@ -20,6 +20,10 @@ DEFAULT_POLICY = "any_team"
 """The bundled policy that decides where none is named."""
 
 
+NO_THREADS = "has no effect without a planner that takes them, such as lns"
+"""What is said of threads that nobody would use."""
+
+
 @dataclass(frozen=True)
 class PlannerOptions:
     """What a user may ask of a planner. Raises InputError naming the option, as it is built.
@@ -94,3 +98,5 @@ class PlannerKind:
     most_targets: int | None = None
     """Open targets that it takes on; None: any number."""
     wants_policy: bool = False
+    parallel: bool = False
+    """Whether it searches with several threads side by side."""

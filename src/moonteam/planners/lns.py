@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,33 +19,38 @@ from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search import insertion
 from moonteam.planners.search.bounds import lower_bounds
+from moonteam.planners.search.insertion import Teams, Ways
 from moonteam.planners.search.task import Task, value_of, weights
 
-MAX_AGENTS = 30
-"""Coalitions are bit masks of 32 bits."""
+MAX_AGENTS = 62
+"""Coalitions are bit masks of 64 bits."""
 
-_HOT, _COLD = 2.0, 0.1  # temperatures in units of one step (or move)
+_HOT, _COLD = 2.0, 0.3  # temperatures in units of one step (or move)
 _STEER = 0.05  # weight of moves while searching for makespan: it breaks ties on plateaus
 _BLOCK = 250  # iterations between looks at the clock, at most
 _FIRST, _SLICE = 5, 0.02  # the first so many; s that they then may take
+_HURRY = 0.1  # s; with less the first plan is made in one way only
+_LARGE = 60  # targets above which insertion looks at few anew each time
 
 
 @dataclass
 class Events:
-    """A list of events: targets in order, each with its coalition as a bit mask."""
+    """A list of events: targets in order, each with its coalition."""
 
     order: IntArray  # [M]
-    team: IntArray  # [M]
+    crew: IntArray  # [M] index into `teams`
+    teams: Teams
 
     def copy(self) -> Events:
         """A list of its own."""
-        return Events(self.order.copy(), self.team.copy())
+        return Events(self.order.copy(), self.crew.copy(), self.teams)
 
     def routes(self, agents: int) -> IntArray:
         """Each agent's targets in order [N, M], padded by -1."""
         out = np.full((agents, len(self.order)), -1, np.int32)
+        masks = self.teams.masks[self.crew]
         for a in range(agents):
-            mine = self.order[self.team >> a & 1 == 1]
+            mine = self.order[masks >> a & 1 == 1]
             out[a, :len(mine)] = mine
         return out
 
@@ -71,26 +77,21 @@ class Weights:
         return max(self.alpha, self.beta)
 
 
-def insert(task: Task, goal: Weights, regret: bool) -> Events:
+def _ways(task: Task) -> Ways:
+    return Ways(task.start, task.between, task.kinds)
+
+
+def insert(task: Task, goal: Weights, teams: Teams, regret: bool) -> Events:
     """A list of events made by insertion, with regret or cheapest first."""
-    agents, count = task.start.shape
-    masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
-    events = Events(np.zeros(count, np.int32), np.zeros(count, np.int32))
-    insertion.insert_all(
-        np.arange(count, dtype=np.int32), regret, task.start, task.between, task.kinds,
-        events.order, events.team, 0, np.zeros(count, np.int32), np.zeros(count, np.int32),
-        np.zeros((count + 1, agents), np.int32), masks, first, goal.alpha, goal.beta,
-        task.horizon, 0.0)
-    return events
+    count = len(task.targets)
+    return Events(*insertion.inserted(
+        _ways(task), teams, regret, goal.alpha, goal.beta, task.horizon,
+        count if count <= _LARGE else insertion.SOME), teams)
 
 
 def measure(task: Task, events: Events) -> tuple[int, int]:
     """(makespan, moves) of a list."""
-    agents, count = task.start.shape
-    return insertion.measure(
-        task.start, task.between, task.kinds, events.order, events.team, count,
-        np.zeros(count, np.int32), np.zeros(count, np.int32),
-        np.zeros((count + 1, agents), np.int32))
+    return insertion.measured(_ways(task), events.teams, events.order, events.crew)
 
 
 def cost(task: Task, goal: Weights, events: Events) -> float:
@@ -98,14 +99,15 @@ def cost(task: Task, goal: Weights, events: Events) -> float:
     return insertion.price(*measure(task, events), goal.true_alpha, goal.true_beta, task.horizon)
 
 
-def best_insertion(task: Task, goal: Weights) -> Events:
-    """The better of the two insertions."""
-    tries = [insert(task, goal, regret) for regret in (True, False)]
+def best_insertion(task: Task, goal: Weights, hurry: bool = False) -> Events:
+    """The better of the two insertions; in a hurry that with regret."""
+    teams = insertion.teams_of(task.start, task.skills, task.need, task.both)
+    tries = [insert(task, goal, teams, regret) for regret in ((True,) if hurry else (True, False))]
     return min(tries, key=lambda events: cost(task, goal, events))
 
 
 def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: int | None,
-            until: float | None) -> Events:
+            until: float | None, threads: int = 1) -> Events:
     """The best list found from `events` on.
 
     Args:
@@ -113,11 +115,25 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
       goal: the weights.
       events: where to begin.
       seed: of the random numbers.
-      iterations: budget; with it alone the result depends on nothing but the seed.
+      iterations: budget; with it alone the result depends on nothing but seed and threads.
       until: `time.perf_counter()` at which to stop.
+      threads: searches side by side, each with the whole budget; the best counts.
     """
-    masks, first = insertion.coalitions(task.start, task.skills, task.need, task.both)
-    now, best = events.copy(), events.copy()
+    if threads == 1:
+        return _improved(task, goal, events, seed, iterations, until)
+    with ThreadPoolExecutor(threads) as pool:
+        found = pool.map(lambda k: _improved(task, goal, events, seed + k * _APART, iterations,
+                                             until), range(threads))
+        return min(found, key=lambda one: cost(task, goal, one))
+
+
+_APART = 1_000_003  # between the seeds of searches side by side
+
+
+def _improved(task: Task, goal: Weights, events: Events, seed: int, iterations: int | None,
+              until: float | None) -> Events:
+    """`improve` in this thread."""
+    now, best, ways = events.copy(), events.copy(), _ways(task)
     began, done, room = time.perf_counter(), 0, _BLOCK if until is None else _FIRST
     cooling = math.log(_COLD / _HOT)
     while len(task.targets) > 1 and iterations != 0:
@@ -130,14 +146,13 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
             break
         block = room if iterations is None else min(room, iterations - done)
         hot = goal.unit * _HOT * math.exp(cooling * share)
-        insertion.improve(
-            task.start, task.between, task.kinds, masks, first, now.order, now.team,
-            goal.alpha, goal.beta, goal.true_alpha, goal.true_beta, task.horizon, block,
-            hot, hot, seed + done, best.order, best.team)
+        insertion.improved(
+            ways, now.teams, now.order, now.crew, goal.alpha, goal.beta, goal.true_alpha,
+            goal.true_beta, task.horizon, block, hot, hot, seed + done, best.order, best.crew)
         done += block
-        if iterations is None:
-            share = _SLICE / max(time.perf_counter() - clock, 1e-6)
-            room = int(min(_BLOCK, max(1, block * min(4.0, share))))
+        if until is not None:
+            clock, each = time.perf_counter(), (time.perf_counter() - began) / done
+            room = int(min(_BLOCK, 4 * block, _SLICE / each, (until - clock) / each)) + 1
     return best
 
 
@@ -156,7 +171,8 @@ class InsertionPlanner(RoutePlanner):
         if low_makespan > task.horizon:
             return Answer(None, bound, True)
         goal = Weights.of(self.objective, self.alpha, self.beta, task)
-        events = self._improved(task, goal, best_insertion(task, goal), began)
+        hurry = self.time_limit is not None and self.time_limit < _HURRY
+        events = self._improved(task, goal, best_insertion(task, goal, hurry), began)
         if measure(task, events)[0] > task.horizon:
             return Answer(None, bound, False)
         return Answer(events.routes(agents), bound, False)
@@ -166,7 +182,7 @@ class InsertionPlanner(RoutePlanner):
 
 
 class LnsPlanner(InsertionPlanner):
-    """Insertion with regret, then large-neighbourhood search; to 10 agents and 60 targets.
+    """Insertion with regret, then large-neighbourhood search; to 50 agents and 500 targets.
 
     Args:
       objective: makespan, moves or weighted.
@@ -175,15 +191,17 @@ class LnsPlanner(InsertionPlanner):
       iterations: budget; None: 2000 unless there is a time limit.
       time_limit: seconds; with it the result depends on the machine's speed.
       seed: of the random numbers.
+      threads: searches side by side, each with the whole budget.
     """
 
     name = "lns"
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
-                 iterations: int | None = None, time_limit: float | None = None, seed: int = 0):
+                 iterations: int | None = None, time_limit: float | None = None, seed: int = 0,
+                 threads: int = 1):
         super().__init__(objective, alpha, beta)
         self.iterations = 2000 if iterations is None and time_limit is None else iterations
-        self.time_limit, self.seed = time_limit, seed
+        self.time_limit, self.seed, self.threads = time_limit, seed, threads
 
     @classmethod
     def _trial(cls) -> LnsPlanner:
@@ -196,11 +214,12 @@ class LnsPlanner(InsertionPlanner):
 
     def _improved(self, task: Task, goal: Weights, events: Events, began: float) -> Events:
         until = None if self.time_limit is None else began + self.time_limit
-        return improve(task, goal, events, self.seed, self.iterations, until)
+        return improve(task, goal, events, self.seed, self.iterations, until, self.threads)
 
 
 def _planner(options: PlannerOptions) -> LnsPlanner:
-    return LnsPlanner(*options.goal, time_limit=options.time_limit, seed=options.seed)
+    return LnsPlanner(*options.goal, time_limit=options.time_limit, seed=options.seed,
+                      threads=options.threads)
 
 
-PLANNER = PlannerKind("lns", _planner, anytime=True)
+PLANNER = PlannerKind("lns", _planner, anytime=True, parallel=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from moonteam.compilation import njit
 from moonteam.planners.search import schedules
-from moonteam.planners.search.insertion import coalitions
+from moonteam.planners.search.insertion import teams_of
 from moonteam.planners.search.task import Task
 from moonteam.planners.search.travel import UNREACHABLE
 
@@ -81,18 +81,19 @@ def forest_bound(start, between, kinds, skills, need, both, rounds):
 
 
 @njit(cache=True, nogil=True)
-def earliest(start, masks, first):
-    """Steps [M] until some coalition can be at each target if it goes straight there."""
-    m = start.shape[1]
-    soonest = np.full(m, UNREACHABLE, np.int32)
-    for t in range(m):
+def earliest(start, first, members):
+    """Steps until some coalition can be at the target that is last to be reached, each straight."""
+    farthest = 0
+    for t in range(start.shape[1]):
+        soonest = UNREACHABLE
         for c in range(first[t], first[t + 1]):
             latest = 0
-            for a in range(start.shape[0]):
-                if masks[c] >> a & 1:
+            for a in members[c]:
+                if a >= 0:
                     latest = max(latest, start[a, t])
-            soonest[t] = min(soonest[t], latest)
-    return soonest
+            soonest = min(soonest, latest)
+        farthest = max(farthest, soonest)
+    return farthest
 
 
 def lower_bounds(task: Task, parts: int = 0) -> tuple[int, int]:
@@ -107,8 +108,8 @@ def lower_bounds(task: Task, parts: int = 0) -> tuple[int, int]:
     """
     if not len(task.targets):
         return 0, 0
-    masks, first = coalitions(task.start, task.skills, task.need, task.both)
-    makespan = int(earliest(task.start, masks, first).max())
+    teams = teams_of(task.start, task.skills, task.need, task.both)
+    makespan = int(earliest(task.start, teams.first, teams.members))
     moves = math.ceil(forest_bound(task.start, task.between, task.kinds, task.skills, task.need,
                                    task.both, ROUNDS) - 1e-6)
     rng = np.random.default_rng(0)
