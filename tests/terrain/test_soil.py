@@ -1,5 +1,6 @@
 """Soils: their names, their scatter, and what a mission may say of them."""
 
+import itertools
 from typing import get_args
 
 import msgspec
@@ -9,8 +10,11 @@ import pytest
 from moonteam.errors import InputError
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import SoilName
+from moonteam.robots import KINDS, team
 from moonteam.terrain.site import for_mission, make_site, with_soil
 from moonteam.terrain.soil import SOILS, drawn, find
+from moonteam.terrain.travel.roads import Roads
+from moonteam.terrain.traversability import ground_under
 
 TEXT = """
 map: {{size: [6, 6]}}
@@ -20,9 +24,12 @@ targets: [{{at: [3, 3], skills: [A]}}]
 """
 
 
-def loaded(tmp_path, more):
+def loaded(tmp_path, more, preset="flat"):
     path = tmp_path / "m.yaml"
-    path.write_text(TEXT.format(more=more))
+    text = TEXT.format(more=more)
+    if preset != "flat":
+        text = text.replace("flat", preset).replace("size: [6, 6]", "size: [20, 20]")
+    path.write_text(text)
     return missions.load(path)
 
 
@@ -74,6 +81,9 @@ def test_a_mission_chooses_its_ground(tmp_path):
      "unknown value 'clay'; allowed: dense, grc1, loose, lunar, nominal"),
     (", soil: loose", "site.soil: is of ground: regolith, which is not given"),
     (", fields: rigid", "site.fields: is of ground: regolith, which is not given"),
+    (", thrift: 0.5", "site.thrift: is of ground: regolith, which is not given"),
+    (", ground: regolith, thrift: 2", "site.thrift: 2 is not allowed; 0 (time) to 1 (energy)"),
+    (", ground: regolith, fields: rigid, thrift: 1", "site.thrift: needs fields: measured"),
 ])
 def test_what_cannot_be_is_said_in_one_line(tmp_path, more, words):
     with pytest.raises(InputError) as error:
@@ -81,3 +91,34 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, more, words):
     told = str(error.value)
     assert "\n" not in told
     assert words in told
+
+
+def test_thrift_saves_energy_for_time(tmp_path):
+    """Way by way over the same ground: never more joules or fewer seconds, and for some less."""
+    spent = {}
+    for thrift in (0.0, 1.0):
+        mission = loaded(tmp_path, f", ground: regolith, thrift: {thrift}", preset="highland")
+        site = for_mission(mission)
+        limits = team.limits({"wheeled": KINDS.get("wheeled")}, site)
+        its = limits["wheeled"]
+        roads = Roads.of_mission(site, mission, limits)
+        rows = []
+        open_ = [(x, y) for x in (-7.0, -2.0, 3.0, 8.0) for y in (-6.0, 0.0, 6.0)
+                 if roads.passable("wheeled", np.array([x, y]))]
+        for a, b in itertools.combinations(open_, 2):
+            seconds = roads.seconds("wheeled", a, b)
+            if seconds == np.inf:
+                continue
+            ends = np.asarray(roads.way("wheeled", a, b).points)
+            share = (np.arange(20) + 0.5) / 20
+            on = ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * share[:, None]
+            slope, _ = ground_under(site, on, its.footprint)
+            length = np.linalg.norm(ends[1:] - ends[:-1], axis=1)
+            per_metre = np.interp(slope, *np.array(its.joules).T).mean(axis=1)
+            rows.append((float((per_metre * length).sum()), seconds))
+        spent[thrift] = np.array(rows)
+    assert len(rows) > 8
+    joules, seconds = (spent[1.0] / spent[0.0]).T
+    assert (joules < 1.02).all()
+    assert joules.min() < 0.98
+    assert (seconds > 0.99).all()

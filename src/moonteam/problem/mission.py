@@ -49,7 +49,8 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
     `ground` is rigid, or regolith, in which wheels and feet sink and slip, of a `soil` that
     `seed` scatters; `fields` of it are as robots were measured on that soil, or as on rigid
-    ground. The other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel`
+    ground; `thrift` is how much a way's energy there counts beside its time, from 0 to 1. The
+    other keys are of a `dem`: which piece of it (`Piece`); metres a `pixel`
     and a unit of elevation (`scale`) where the file does not say; `detrend` takes the plane of
     best fit out; `detail` adds relief finer than its pixels, from `seed`.
     """
@@ -60,6 +61,7 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     ground: Literal["rigid", "regolith"] = "rigid"
     soil: SoilName = "nominal"
     fields: Literal["measured", "rigid"] = "measured"
+    thrift: float = 0.0
     centre: tuple[float, float] | None = None
     size: float | tuple[float, float] | None = None
     units: Units = "metres"
@@ -77,7 +79,7 @@ class Site(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 MODEL_ONLY = tuple(key for key in Site.__struct_fields__
-                   if key not in ("preset", "dem", "seed", "ground", "soil", "fields"))
+                   if key not in ("preset", "dem", "seed", "ground", "soil", "fields", "thrift"))
 """Keys of a site that mean nothing without a dem."""
 
 
@@ -350,7 +352,12 @@ def _check_site(site: Site, source: object) -> None:
             if getattr(site, key) != getattr(Site(), key):
                 raise InputError(source, "is for an elevation model; give dem in place of preset",
                                  f"site.{key}")
-    for key in ("soil", "fields"):
+    if not 0 <= site.thrift <= 1:
+        raise InputError(source, f"{site.thrift:g} is not allowed; 0 (time) to 1 (energy)",
+                         "site.thrift")
+    if site.thrift and site.fields == "rigid":
+        raise InputError(source, "needs fields: measured; rigid ones know no energy", "site.thrift")
+    for key in ("soil", "fields", "thrift"):
         if site.ground == "rigid" and getattr(site, key) != getattr(Site(), key):
             raise InputError(source, "is of ground: regolith, which is not given", f"site.{key}")
     site.piece.check(lambda key, problem: InputError(source, problem, f"site.{key}"))

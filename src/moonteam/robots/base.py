@@ -148,8 +148,11 @@ class RobotKind:
     def limits_on(self, soil: str | None) -> Limits:
         """What ground of a soil it can cross, as maps ask for it; None: rigid ground."""
         pace = self.paces.get(soil or "", Pace(self.speed, self.max_slope, self.slowing))
+        there = dict(zip(pace.slopes, pace.energy, strict=True))
+        joules = tuple((slope, (there[slope] + there.get(-slope, there[slope])) / 2.0)
+                       for slope in pace.slopes if slope >= 0.0) if there else ()
         return Limits(self.footprint, pace.max_slope, self.max_step, pace.speed, pace.slowing,
-                      self.flies)
+                      self.flies, joules)
 
 
 def paces_of(name: str) -> dict[str, Pace]:

@@ -45,6 +45,7 @@ class Limits:
     speed: float  # m/s on the level
     slowing: float  # share of speed lost on max_slope
     flies: bool
+    joules: tuple[tuple[float, float], ...] = ()  # slope rad, J/m there up and down in the mean
 
 
 def passable_cells(site: Site, mission: Mission, limits: Mapping[str, Limits]

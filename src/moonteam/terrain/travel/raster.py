@@ -111,6 +111,19 @@ def fresh_slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
         return np.where(able, 1.0 / (limits.speed * (1.0 - slowing)), np.inf)
 
 
+def costs(site: Site, raster: Raster, limits: Limits, thrift: float) -> FloatMap:
+    """[H, W] what a second counts at the raster's points, for a kind that saves energy.
+
+    A metre costs (1 - thrift) times its time and thrift times its energy, each as a share of that
+    on the level; `limits.joules` says the energy by slope.
+    """
+    slope, _ = ground_under(site, raster.points(), limits.footprint)
+    slopes, joules = np.array(limits.joules).T
+    energy = np.interp(slope, slopes, joules) / joules[0]
+    slowed = 1.0 - limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
+    return 1.0 - thrift + thrift * energy * slowed
+
+
 def _kept_clear(able: BoolMap, raster: Raster) -> BoolMap:
     """[H, W] points that are able and have none about them, within `stray` m, that is not.
 

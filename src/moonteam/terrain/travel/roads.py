@@ -25,7 +25,7 @@ from moonteam.terrain.light import PANEL, lit_at
 from moonteam.terrain.site import Site
 from moonteam.terrain.travel.field import REACH, look_ups, renew, solve
 from moonteam.terrain.travel.lines import at, line_seconds
-from moonteam.terrain.travel.raster import Raster, slowness
+from moonteam.terrain.travel.raster import Raster, costs, slowness
 from moonteam.terrain.travel.ways import way
 from moonteam.terrain.traversability import BoolMap, FloatMap, Limits
 
@@ -161,14 +161,18 @@ class Roads:
 
     @classmethod
     def of_mission(cls, site: Site, mission: Mission, limits: Mapping[str, Limits]) -> Roads:
-        """Over the mission's map; kinds of robots with a battery keep to the light as it says."""
+        """Over the mission's map; kinds of robots with a battery keep to the light as it says, and
+        all save energy as its site says.
+        """
         size, cell_m, sun = mission.map.size, mission.map.cell_m, mission.sun
-        if sun is None or sun.dark == 1.0 or not mission.powered():
-            return cls.over(site, size, cell_m, limits)
-        lit = lit_at(site, sun.position(), Raster(size, cell_m).points(), PANEL)
-        weight = np.where(lit, 1.0, sun.dark)
-        return cls.over(site, size, cell_m, limits, {
-            mission.robots[i].kind: weight for i in mission.powered()})
+        raster = Raster(size, cell_m)
+        weights = {kind: costs(site, raster, its, mission.site.thrift)
+                   for kind, its in limits.items() if its.joules and mission.site.thrift}
+        if sun is not None and sun.dark != 1.0 and mission.powered():
+            lit = lit_at(site, sun.position(), raster.points(), PANEL)
+            for kind in {mission.robots[i].kind for i in mission.powered()}:
+                weights[kind] = np.where(lit, 1.0, sun.dark) * weights.get(kind, 1.0)
+        return cls.over(site, size, cell_m, limits, weights)
 
     def passable(self, kind: str, xy: Points) -> bool:
         """Whether a robot of the kind may be sent to xy [2] m."""
