@@ -142,3 +142,48 @@ def test_an_evaluation_in_physics_survives_kills(tmp_path, mode):
     assert found[0]["summary"] == found[1]["summary"]
     lines = [sorted((folder / "rows.jsonl").read_text().splitlines()) for folder in (whole, parts)]
     assert lines[0] == lines[1]
+
+
+PLANNING = """
+import signal
+
+from moonteam import grid
+from moonteam.planners.base import Snapshot
+from moonteam.planners.lns import LnsPlanner
+
+moment = Snapshot.start(grid.generate(0, num_agents=8, num_targets=40))
+LnsPlanner(time_limit=0.003).plan(moment)
+planning = False
+
+
+def interrupt(number, frame):
+    global planning
+    if planning:
+        planning = False
+        raise KeyboardInterrupt
+
+
+signal.signal(signal.SIGINT, interrupt)
+print("ready", flush=True)
+while True:
+    try:
+        planning = True
+        LnsPlanner(time_limit=0.003).plan(moment)
+        planning = False
+    except KeyboardInterrupt:
+        pass
+"""
+
+
+def test_an_interruption_inside_the_search_never_crashes_it():
+    """What Numba runs of Python while it takes and returns arguments may not meet a signal."""
+    with subprocess.Popen([sys.executable, "-c", PLANNING], stdout=subprocess.PIPE,
+                          stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"ready\n"
+        rng = random.Random(0)
+        for _ in range(150):
+            time.sleep(rng.uniform(0.004, 0.012))
+            process.send_signal(signal.SIGINT)
+        time.sleep(0.1)
+        assert process.poll() is None, process.stderr.read().decode()[-2000:]
+        process.kill()
