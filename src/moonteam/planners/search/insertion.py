@@ -37,6 +37,11 @@ goes only where much is made anew.
 SOME = 2
 """Targets looked at anew for each that is put back."""
 
+CRITICAL = 0.75
+"""Share of the removals near an event that is about one on the critical chain: others leave the
+makespan as it is.
+"""
+
 
 class Ways(NamedTuple):
     """Travel times in steps."""
@@ -351,7 +356,7 @@ def choose_removed(ways, teams, line, length, makespan, most, removed):
     wanted = min(length, 1 + np.random.randint(most))
     way = np.random.randint(4)
     seed = np.random.randint(length)
-    if way == 2:
+    if way == 2 or (way != 0 and np.random.random() < CRITICAL):
         tries = 0
         while head[seed] + tail[seed] < makespan and tries < 4 * length:
             seed = np.random.randint(length)
