@@ -8,7 +8,7 @@ from typing import Literal
 from moonteam.errors import InputError
 from moonteam.grid.macro.draw import Draw
 from moonteam.policies.pointer import PointerSpec
-from training.mappo.macro.hyper import Hyper, Vine
+from training.mappo.macro.hyper import Best, Hyper, Vine
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,9 @@ class Practice:
     """P, maps with blocked cells made beforehand and drawn from; 0: open maps."""
     shrink: int = 1
     """Environments, or moments branched, are this many times fewer: large problems cost more."""
-    advantages: Literal["vine", "critic"] = "vine"
-    """From branches played out, or from the critic."""
+    advantages: Literal["vine", "critic", "best"] = "vine"
+    """From branches played out, or from the critic; best: none, what was chosen along the best of
+    several tries is learned."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class MacroConfig:
     """Of an update."""
     vine: Vine = field(default_factory=Vine)
     """Of an update by branches."""
+    best: Best = field(default_factory=Best)
+    """Of an update by the best tries."""
     spec: PointerSpec = field(default_factory=PointerSpec)
     """Size of the network."""
     lr: float = 2e-3
@@ -67,24 +70,33 @@ class MacroConfig:
                 raise InputError(self.macro, f"{getattr(self, key)} is not allowed; at least 1",
                                  key)
         for name, keys in (("hyper", ("num_steps", "epochs", "minibatches", "part")),
-                           ("vine", ("episodes", "moments", "epochs", "minibatches", "longest"))):
+                           ("vine", ("episodes", "moments", "epochs", "minibatches", "longest")),
+                           ("best", ("problems", "epochs", "rows"))):
             for key in keys:
                 if (value := getattr(getattr(self, name), key)) < 1:
                     raise InputError(self.macro, f"{value} is not allowed; at least 1",
                                      f"{name}.{key}")
-        if self.vine.options < 2:
-            raise InputError(self.macro, f"{self.vine.options} is not allowed; at least 2 options",
-                             "vine.options")
-        if self.vine.tau <= 0.0:
-            raise InputError(self.macro, f"{self.vine.tau:g} is not allowed; above 0", "vine.tau")
+        for key, value in (("vine.options", self.vine.options), ("best.tries", self.best.tries)):
+            if value < 2:
+                raise InputError(self.macro, f"{value} is not allowed; at least 2", key)
+        for key, value in (("vine.tau", self.vine.tau), ("best.heat", self.best.heat)):
+            if value <= 0.0:
+                raise InputError(self.macro, f"{value:g} is not allowed; above 0", key)
         if not 0.0 < self.lr <= 0.1:
             raise InputError(self.macro, f"{self.lr:g} is not allowed; above 0, at most 0.1", "lr")
-        if not 0.0 < self.hyper.learned <= 1.0:
-            raise InputError(self.macro, f"{self.hyper.learned:g} is not allowed; above 0, at most "
-                             "1", "hyper.learned")
+        for key, value in (("hyper.learned", self.hyper.learned),
+                           ("best.learned", self.best.learned)):
+            if not 0.0 < value <= 1.0:
+                raise InputError(self.macro, f"{value:g} is not allowed; above 0, at most 1", key)
         for one in self.families:
             if one.advantages == "vine":
                 self._check(one)
+                continue
+            if one.advantages == "best":
+                if self.tried(one).moments < 1:
+                    raise InputError(self.macro, f"{self.tried(one).problems} problems of "
+                                     f"{one.name} leave no moments to learn from",
+                                     "best.problems")
                 continue
             rows = self.rows(one)
             if self.envs(one) < 1 or rows < 1 or rows % self.hyper.minibatches:
@@ -113,6 +125,11 @@ class MacroConfig:
                        moments=vine.moments // family.shrink,
                        minibatches=max(1, vine.minibatches // family.shrink))
 
+    def tried(self, family: Practice) -> Best:
+        """Of a family: fewer large problems."""
+        return replace(self.best, num_steps=self.best.num_steps or 2 * family.draw.entries,
+                       problems=self.best.problems // family.shrink)
+
     def envs(self, family: Practice) -> int:
         """Environments of a family."""
         return self.num_envs // family.shrink
@@ -125,6 +142,7 @@ class MacroConfig:
     def decisions(self) -> int:
         """Moments in a round from which is learned or that are decided, of all families."""
         return sum(self.grown(f).moments if f.advantages == "vine"
+                   else self.tried(f).moments if f.advantages == "best"
                    else self.envs(f) * self.hyper.num_steps for f in self.families)
 
 
@@ -161,6 +179,13 @@ PRESETS = {
         ),
         # Of many targets returns are long, and their squared error could drown the choices.
         rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5),
+}
+"""By the word behind `moonteam train`."""
+PRESETS["any_team_best"] = replace(
+    PRESETS["any_team"], macro="any_team_best", lr=3e-4, families=tuple(
+        replace(one, advantages="best", shrink=min(one.shrink, 32))
+        for one in PRESETS["any_team"].families))
+PRESETS |= {
     "unfolding": MacroConfig(
         "unfolding", (
             Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),

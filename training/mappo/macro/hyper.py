@@ -80,3 +80,43 @@ class Vine:
     def over(self, devices: int) -> Vine:
         """The share of one of them."""
         return replace(self, episodes=self.episodes // devices, moments=self.moments // devices)
+
+
+@dataclass(frozen=True)
+class Best:
+    """Of updates by the policy's own best episodes, see `best`."""
+
+    problems: int = 256
+    """I, drawn for an update; fewer of a family that shrinks."""
+    tries: int = 16
+    """K, episodes of each: the likeliest, and others drawn; of many targets each cooler than the
+    one before."""
+    heat: float = 1.0
+    """Temperature of the hottest."""
+    num_steps: int = 0
+    """L, decisions after which a try is given up; 0: twice the most targets."""
+    learned: float = 0.375
+    """Share of the I x L decisions that is learned from; those that were made, and at which
+    somebody had a choice, first."""
+    rows: int = 64
+    """Moments of a minibatch."""
+    epochs: int = 2
+    """Passes over the moments."""
+
+    @property
+    def minibatches(self) -> int:
+        """Of a pass."""
+        return max(1, self._learned // self.rows)
+
+    @property
+    def moments(self) -> int:
+        """S, learned from."""
+        return self._learned // self.minibatches * self.minibatches
+
+    @property
+    def _learned(self) -> int:
+        return int(self.problems * self.num_steps * self.learned)
+
+    def over(self, devices: int) -> Best:
+        """The share of one of them."""
+        return replace(self, problems=self.problems // devices)
