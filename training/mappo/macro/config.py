@@ -8,7 +8,7 @@ from typing import Literal
 from moonteam.errors import InputError
 from moonteam.grid.macro.draw import Draw
 from moonteam.policies.pointer import PointerSpec
-from training.mappo.macro.hyper import Best, Hyper, Vine
+from training.mappo.macro.hyper import Hyper, Tries, Vine
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,8 @@ class Practice:
     """P, maps with blocked cells made beforehand and drawn from; 0: open maps."""
     shrink: int = 1
     """Environments, or moments branched, are this many times fewer: large problems cost more."""
-    advantages: Literal["vine", "critic", "best"] = "vine"
-    """From branches played out, or from the critic; best: none, what was chosen along the best of
-    several tries is learned."""
+    advantages: Literal["vine", "critic", "tries"] = "vine"
+    """From branches played out, from the critic, or from whole tries of the same problem."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,8 @@ class MacroConfig:
     """Of an update."""
     vine: Vine = field(default_factory=Vine)
     """Of an update by branches."""
-    best: Best = field(default_factory=Best)
-    """Of an update by the best tries."""
+    tries: Tries = field(default_factory=Tries)
+    """Of an update by whole tries."""
     spec: PointerSpec = field(default_factory=PointerSpec)
     """Size of the network."""
     lr: float = 2e-3
@@ -71,32 +70,32 @@ class MacroConfig:
                                  key)
         for name, keys in (("hyper", ("num_steps", "epochs", "minibatches", "part")),
                            ("vine", ("episodes", "moments", "epochs", "minibatches", "longest")),
-                           ("best", ("problems", "epochs", "rows"))):
+                           ("tries", ("problems", "epochs", "rows"))):
             for key in keys:
                 if (value := getattr(getattr(self, name), key)) < 1:
                     raise InputError(self.macro, f"{value} is not allowed; at least 1",
                                      f"{name}.{key}")
-        for key, value in (("vine.options", self.vine.options), ("best.tries", self.best.tries)):
+        for key, value in (("vine.options", self.vine.options), ("tries.each", self.tries.each)):
             if value < 2:
                 raise InputError(self.macro, f"{value} is not allowed; at least 2", key)
-        for key, value in (("vine.tau", self.vine.tau), ("best.heat", self.best.heat)):
+        for key, value in (("vine.tau", self.vine.tau), ("tries.heat", self.tries.heat)):
             if value <= 0.0:
                 raise InputError(self.macro, f"{value:g} is not allowed; above 0", key)
         if not 0.0 < self.lr <= 0.1:
             raise InputError(self.macro, f"{self.lr:g} is not allowed; above 0, at most 0.1", "lr")
         for key, value in (("hyper.learned", self.hyper.learned),
-                           ("best.learned", self.best.learned)):
+                           ("tries.learned", self.tries.learned)):
             if not 0.0 < value <= 1.0:
                 raise InputError(self.macro, f"{value:g} is not allowed; above 0, at most 1", key)
         for one in self.families:
             if one.advantages == "vine":
                 self._check(one)
                 continue
-            if one.advantages == "best":
+            if one.advantages == "tries":
                 if self.tried(one).moments < 1:
                     raise InputError(self.macro, f"{self.tried(one).problems} problems of "
                                      f"{one.name} leave no moments to learn from",
-                                     "best.problems")
+                                     "tries.problems")
                 continue
             rows = self.rows(one)
             if self.envs(one) < 1 or rows < 1 or rows % self.hyper.minibatches:
@@ -125,10 +124,10 @@ class MacroConfig:
                        moments=vine.moments // family.shrink,
                        minibatches=max(1, vine.minibatches // family.shrink))
 
-    def tried(self, family: Practice) -> Best:
+    def tried(self, family: Practice) -> Tries:
         """Of a family: fewer large problems."""
-        return replace(self.best, num_steps=self.best.num_steps or 2 * family.draw.entries,
-                       problems=self.best.problems // family.shrink)
+        return replace(self.tries, num_steps=self.tries.num_steps or 2 * family.draw.entries,
+                       problems=self.tries.problems // family.shrink)
 
     def envs(self, family: Practice) -> int:
         """Environments of a family."""
@@ -142,7 +141,7 @@ class MacroConfig:
     def decisions(self) -> int:
         """Moments in a round from which is learned or that are decided, of all families."""
         return sum(self.grown(f).moments if f.advantages == "vine"
-                   else self.tried(f).moments if f.advantages == "best"
+                   else self.tried(f).moments if f.advantages == "tries"
                    else self.envs(f) * self.hyper.num_steps for f in self.families)
 
 
@@ -181,10 +180,12 @@ PRESETS = {
         rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5),
 }
 """By the word behind `moonteam train`."""
-PRESETS["any_team_best"] = replace(
-    PRESETS["any_team"], macro="any_team_best", lr=3e-4, families=tuple(
-        replace(one, advantages="best", shrink=min(one.shrink, 32))
-        for one in PRESETS["any_team"].families))
+PRESETS["any_team_further"] = replace(
+    # Of many robots and targets whole tries say more than branches, and are cheap enough for more.
+    PRESETS["any_team"], macro="any_team_further", lr=1.5e-4, families=(
+        *PRESETS["any_team"].families[:6],
+        *(replace(one, advantages="tries", shrink=one.shrink // 2)
+          for one in PRESETS["any_team"].families[6:])))
 PRESETS |= {
     "unfolding": MacroConfig(
         "unfolding", (

@@ -12,7 +12,7 @@ from moonteam.policies.pointer import Outlook
 
 @dataclass(frozen=True)
 class Hyper:
-    """Of both kinds of update."""
+    """Of all kinds of update."""
 
     num_steps: int = 16
     """T, decisions of each environment between updates."""
@@ -83,24 +83,22 @@ class Vine:
 
 
 @dataclass(frozen=True)
-class Best:
-    """Of updates by the policy's own best episodes, see `best`."""
+class Tries:
+    """Of updates by whole tries, see `tries`."""
 
     problems: int = 256
     """I, drawn for an update; fewer of a family that shrinks."""
-    tries: int = 16
-    """K, episodes of each: the likeliest, and others drawn; of many targets each cooler than the
-    one before."""
-    heat: float = 1.0
-    """Temperature of the hottest."""
+    each: int = 16
+    """K, tries of each."""
+    heat: float = 0.5
+    """Temperature of the policy that is tried, and learned."""
     num_steps: int = 0
     """L, decisions after which a try is given up; 0: twice the most targets."""
-    learned: float = 0.375
-    """Share of the I x L decisions that is learned from; those that were made, and at which
-    somebody had a choice, first."""
-    rows: int = 64
+    learned: float = 0.1
+    """Share of the I x K x L decisions that is learned from, the undecided first."""
+    rows: int = 256
     """Moments of a minibatch."""
-    epochs: int = 2
+    epochs: int = 1
     """Passes over the moments."""
 
     @property
@@ -115,8 +113,8 @@ class Best:
 
     @property
     def _learned(self) -> int:
-        return int(self.problems * self.num_steps * self.learned)
+        return int(self.problems * self.each * self.num_steps * self.learned)
 
-    def over(self, devices: int) -> Best:
+    def over(self, devices: int) -> Tries:
         """The share of one of them."""
         return replace(self, problems=self.problems // devices)

@@ -20,7 +20,7 @@ from tests.killed import kill_when_saved
 from training.mappo.macro import grounds
 from training.mappo.macro.config import PRESETS, MacroConfig, Practice
 from training.mappo.macro.held_out import HeldOut, moment_of
-from training.mappo.macro.hyper import Best, Hyper, Vine
+from training.mappo.macro.hyper import Hyper, Tries, Vine
 from training.mappo.macro.trainee import MacroMappo
 from training.mappo.macro.update import Batch, chosen, collect, fresh, loss
 from training.run import checkpoints, metrics
@@ -30,13 +30,13 @@ SPEC = PointerSpec(width=16, heads=2, layers=1, pairs=8)
 SMALL = Draw(agents=(2, 2), targets=(2, 2), sides=(6, 6), limit=60.0)
 HYPER = Hyper(num_steps=4, learned=0.5, minibatches=2)
 VINE = Vine(episodes=8, num_steps=4, moments=16, minibatches=2)
-BEST = Best(problems=8, tries=3, rows=8)
+TRIES = Tries(problems=8, each=3, rows=8)
 TINY = MacroConfig("quick", (Practice("small", SMALL, advantages="critic"),), rounds=3, num_envs=8,
-                   hyper=HYPER, vine=VINE, best=BEST, spec=SPEC, chunk_rounds=1, eval_every=1,
+                   hyper=HYPER, vine=VINE, tries=TRIES, spec=SPEC, chunk_rounds=1, eval_every=1,
                    eval_scenarios=32)
 BOTH = dataclasses.replace(
     TINY, families=(*TINY.families, Practice("closed", SMALL, grounds=8, shrink=2),
-                    Practice("tried", SMALL, shrink=2, advantages="best")), rounds=6,
+                    Practice("tried", SMALL, shrink=2, advantages="tries")), rounds=6,
     hyper=dataclasses.replace(HYPER, spread=True))
 SMALLER = ("from training.mappo.macro import config; "
            "from tests.training.mappo.macro.test_macro import BOTH; "
@@ -137,14 +137,14 @@ def test_a_better_choice_becomes_likelier(trainee, flat):
     assert np.asarray(after)[real].mean() > np.asarray(flat.log_prob)[real].mean()
 
 
-@pytest.mark.parametrize("advantages", ["critic", "vine", "best"])
+@pytest.mark.parametrize("advantages", ["critic", "vine", "tries"])
 def test_training_learns(advantages):
     """A minute's worth of a toy: the held-out gap falls."""
     config = dataclasses.replace(
         TINY, families=(Practice("small", SMALL, advantages=advantages),), rounds=40, num_envs=64,
         chunk_rounds=40, lr=3e-3, hyper=dataclasses.replace(HYPER, num_steps=8, minibatches=4),
         vine=Vine(episodes=64, num_steps=6, moments=128, minibatches=4),
-        best=Best(problems=64, tries=8, rows=32))
+        tries=Tries(problems=64, each=8, rows=64))
     trainee = MacroMappo(config)
     before = trainee.evaluate()[0]
     figures = trainee.chunk(Position("macro")).figures
@@ -267,14 +267,14 @@ def test_impossible_numbers(tmp_path, capsys):
         with pytest.raises(InputError, match=rf"vine\.{key}: 0 is not allowed"):
             dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, **{key: value}))
     for key, value in (("heat", 0.0), ("learned", 0.0), ("problems", 0), ("rows", 0)):
-        with pytest.raises(InputError, match=rf"best\.{key}: 0 is not allowed"):
-            dataclasses.replace(BOTH, best=dataclasses.replace(BEST, **{key: value}))
+        with pytest.raises(InputError, match=rf"tries\.{key}: 0 is not allowed"):
+            dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, **{key: value}))
     with pytest.raises(InputError, match="1 problems of tried"):
-        dataclasses.replace(BOTH, best=dataclasses.replace(BEST, problems=2, learned=0.1))
+        dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, problems=2, learned=0.05))
     with pytest.raises(InputError, match=r"vine\.options: 1 is not allowed; at least 2"):
         dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, options=1))
-    with pytest.raises(InputError, match=r"best\.tries: 1 is not allowed; at least 2"):
-        dataclasses.replace(BOTH, best=dataclasses.replace(BEST, tries=1))
+    with pytest.raises(InputError, match=r"tries\.each: 1 is not allowed; at least 2"):
+        dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, each=1))
     assert main(["train", "quick", "--policy", "small", "--out", str(tmp_path / "x")]) == 2
     assert "only pointer policies" in capsys.readouterr().err
 
