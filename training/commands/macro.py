@@ -1,4 +1,4 @@
-"""`moonteam train quick|paper_team|any_team|unfolding`: MAPPO on macro-decisions."""
+"""`moonteam train quick|paper_team|any_team|any_team_further|..`: MAPPO on macro-decisions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from training.sharding import devices_here
 class Args(Together, Apart, Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
     on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one);
-    unfolding where not everything is known.
+    any_team_further goes on from it; unfolding where not everything is known.
 
     A decision is a target, held until something happens. Every number of the preset can be
     changed by an option.
@@ -42,7 +42,7 @@ class Args(Together, Apart, Watched):
       moonteam train paper_team --seeds 0 1 2 --out runs/team
       moonteam train paper_team --seeds 0 1 2 --out runs/team --on ray://head:10001
       moonteam train any_team --out runs/any --resume
-      moonteam train any_team --policy any_team --lr 3e-4 --rounds 300 --out runs/further
+      moonteam train any_team_further --policy any_team_mappo --out runs/further
     """
 
     config: Annotated[MacroConfig, tyro.conf.arg(name="")]

@@ -88,31 +88,30 @@ class MacroConfig:
             if not 0.0 < value <= 1.0:
                 raise InputError(self.macro, f"{value:g} is not allowed; above 0, at most 1", key)
         for one in self.families:
-            if one.advantages == "vine":
-                self._check(one)
-                continue
-            if one.advantages == "tries":
-                if self.tried(one).moments < 1:
-                    raise InputError(self.macro, f"{self.tried(one).problems} problems of "
-                                     f"{one.name} leave no moments to learn from",
-                                     "tries.problems")
-                continue
-            rows = self.rows(one)
-            if self.envs(one) < 1 or rows < 1 or rows % self.hyper.minibatches:
-                raise InputError(
-                    self.macro, f"{self.hyper.minibatches} minibatches do not divide the {rows} "
-                    f"moments learned from of {self.envs(one)} environments x "
-                    f"{self.hyper.num_steps} decisions of {one.name}", "hyper.minibatches")
+            self._check(one)
 
     def _check(self, family: Practice) -> None:
-        """Of a family that is branched."""
-        vine = self.grown(family)
-        if vine.moments < 1 or vine.moments % vine.minibatches or (
-                vine.moments > vine.episodes * vine.num_steps):
-            raise InputError(self.macro, f"{vine.moments} moments of {family.name} are not "
-                             f"divided by {vine.minibatches} minibatches, are more than its "
-                             f"{vine.episodes} x {vine.num_steps} decisions, or none",
-                             "vine.moments")
+        """Whether there is enough of a family, and whether it can be parted."""
+        if family.advantages == "vine":
+            vine = self.grown(family)
+            if vine.moments < 1 or vine.moments % vine.minibatches or (
+                    vine.moments > vine.episodes * vine.num_steps):
+                raise InputError(self.macro, f"{vine.moments} moments of {family.name} are not "
+                                 f"divided by {vine.minibatches} minibatches, are more than its "
+                                 f"{vine.episodes} x {vine.num_steps} decisions, or none",
+                                 "vine.moments")
+        elif family.advantages == "tries":
+            tries = self.tried(family)
+            if tries.moments < 1:
+                raise InputError(self.macro, f"{tries.problems} problems of {family.name} leave "
+                                 "no moments to learn from", "tries.problems")
+        else:
+            rows = self.rows(family)
+            if self.envs(family) < 1 or rows < 1 or rows % self.hyper.minibatches:
+                raise InputError(
+                    self.macro, f"{self.hyper.minibatches} minibatches do not divide the {rows} "
+                    f"moments learned from of {self.envs(family)} environments x "
+                    f"{self.hyper.num_steps} decisions of {family.name}", "hyper.minibatches")
 
     def grown(self, family: Practice) -> Vine:
         """Of a family: fewer moments of large problems, in fewer minibatches of the same size."""
@@ -137,12 +136,16 @@ class MacroConfig:
         """Moments of a family that a pass learns from."""
         return int(self.envs(family) * self.hyper.num_steps * self.hyper.learned)
 
+    def moments(self, family: Practice) -> int:
+        """Of a family in a round: those learned from, with the critic all that are decided."""
+        if family.advantages == "critic":
+            return self.envs(family) * self.hyper.num_steps
+        return (self.grown if family.advantages == "vine" else self.tried)(family).moments
+
     @property
     def decisions(self) -> int:
-        """Moments in a round from which is learned or that are decided, of all families."""
-        return sum(self.grown(f).moments if f.advantages == "vine"
-                   else self.tried(f).moments if f.advantages == "tries"
-                   else self.envs(f) * self.hyper.num_steps for f in self.families)
+        """Moments in a round, of all families."""
+        return sum(self.moments(family) for family in self.families)
 
 
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())

@@ -102,6 +102,11 @@ class Tries:
     """Passes over the moments."""
 
     @property
+    def episodes(self) -> int:
+        """I x K, played."""
+        return self.problems * self.each
+
+    @property
     def minibatches(self) -> int:
         """Of a pass."""
         return max(1, self._learned // self.rows)
@@ -113,7 +118,7 @@ class Tries:
 
     @property
     def _learned(self) -> int:
-        return int(self.problems * self.each * self.num_steps * self.learned)
+        return int(self.episodes * self.num_steps * self.learned)
 
     def over(self, devices: int) -> Tries:
         """The share of one of them."""
