@@ -238,9 +238,10 @@ def _on_each(spec: PointerSpec, family: Draw, hyper: Hyper, tries: Tries,
     learner, said = descend(learner, hyper, part_loss, rows, choices(rows),
                             order.reshape(tries.epochs * tries.minibatches, -1), lr)
     spread, critic = said.mean(axis=0)
-    means = jnp.stack([jnp.mean(played.solved), spread, critic,
-                       jnp.mean(cost - jnp.min(cost, axis=1, keepdims=True))])
-    return learner, Compared(*jax.lax.pmean(means, AXIS), jax.lax.psum(cost.size, AXIS))
+    gain = jnp.mean(cost - jnp.min(cost, axis=1, keepdims=True))
+    success, spread, critic, gain = jax.lax.pmean(
+        (jnp.mean(played.solved), spread, critic, gain), AXIS)
+    return learner, Compared(success, spread, critic, gain, jax.lax.psum(cost.size, AXIS))
 
 
 @partial(jax.jit, static_argnames=("mesh", "spec", "family", "hyper", "tries"),
