@@ -155,6 +155,11 @@ def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
 
         spec = dataclasses.replace(spec, unfolds=True)
         params = pointer.grafted(spec, params)
+    if args.config.spec.layers > spec.layers:
+        from moonteam.policies import pointer
+
+        params = pointer.deepened(spec, params, args.config.spec.layers)
+        spec = dataclasses.replace(spec, layers=args.config.spec.layers)
     return dataclasses.replace(args.config, spec=spec), params, args.policy
 
 
