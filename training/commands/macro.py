@@ -50,9 +50,10 @@ class Args(Together, Apart, Watched):
     seeds: tuple[int, ...] = ()
     """Several runs one after the other, or side by side with --on, each in OUT/SEED, then put side
     by side in OUT."""
-    policy: str = ""
+    policy: tuple[str, ...] = ()
     """Policy file (.safetensors) or the name of a bundled policy, of kind pointer, to go on from
-    instead of fresh weights."""
+    instead of fresh weights; of several of one size, the mean of their weights. With more
+    --spec.layers than it has, blocks are added that change nothing at first."""
 
 
 def parse(words: list[str]) -> Args:
@@ -149,18 +150,33 @@ def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
     """What a run is made from: numbers, weights to go on from if any, and where these are from."""
     if not args.policy:
         return args.config, None, ""
-    spec, params = _pointer(args.policy)
-    if args.config.spec.unfolds and not spec.unfolds:
-        from moonteam.policies import pointer
+    from moonteam.policies import pointer
 
+    spec, params = _mean(args.policy)
+    if args.config.spec.unfolds and not spec.unfolds:
         spec = dataclasses.replace(spec, unfolds=True)
         params = pointer.grafted(spec, params)
     if args.config.spec.layers > spec.layers:
-        from moonteam.policies import pointer
-
         params = pointer.deepened(spec, params, args.config.spec.layers)
         spec = dataclasses.replace(spec, layers=args.config.spec.layers)
-    return dataclasses.replace(args.config, spec=spec), params, args.policy
+    return dataclasses.replace(args.config, spec=spec), params, " ".join(args.policy)
+
+
+def _mean(names: tuple[str, ...]) -> tuple[Any, Any]:
+    """Size of pointer policies, and the mean of their parameters: those that went on from the same
+    one are often better together than each (Wortsman et al. 2022, "Model soups").
+
+    Raises InputError if they are of unlike sizes.
+    """
+    import jax
+    import numpy as np
+
+    found = [_pointer(name) for name in names]
+    spec = found[0][0]
+    for name, (other, _) in zip(names, found, strict=True):
+        if other != spec:
+            raise InputError(name, f"is of another size than {names[0]}: {other}, {spec}", "policy")
+    return spec, jax.tree.map(lambda *each: np.mean(each, axis=0), *(params for _, params in found))
 
 
 def _pointer(name: str) -> tuple[Any, Any]:

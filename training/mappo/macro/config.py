@@ -185,7 +185,9 @@ PRESETS = {
 """By the word behind `moonteam train`."""
 PRESETS["any_team_further"] = replace(
     # Of many robots and targets whole tries say more than branches, and are cheap enough for more.
-    PRESETS["any_team"], macro="any_team_further", lr=1.5e-4, families=(
+    PRESETS["any_team"], macro="any_team_further", rounds=150, lr=2e-4,
+    # A deeper network, whose noise is averaged over longer: it goes on from a good one.
+    spec=PointerSpec(layers=5), hyper=replace(PRESETS["any_team"].hyper, ema=0.9995), families=(
         *PRESETS["any_team"].families[:6],
         *(replace(one, advantages="tries", shrink=one.shrink // 2)
           for one in PRESETS["any_team"].families[6:])))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from moonteam import paths
 from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.grid.macro import world
@@ -17,6 +18,7 @@ from moonteam.policies.pointer import PointerSpec, look, point
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import load_policy
 from tests.killed import kill_when_saved
+from training.commands import macro
 from training.mappo.macro import grounds
 from training.mappo.macro.config import PRESETS, MacroConfig, Practice
 from training.mappo.macro.held_out import HeldOut, moment_of
@@ -277,6 +279,25 @@ def test_impossible_numbers(tmp_path, capsys):
         dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, each=1))
     assert main(["train", "quick", "--policy", "small", "--out", str(tmp_path / "x")]) == 2
     assert "only pointer policies" in capsys.readouterr().err
+
+
+def test_it_goes_on_from_the_mean_of_policies_with_more_blocks_and_the_same_words(capsys):
+    several = macro.parse(["any_team", "--policy", "paper_team", "any_team_mappo",
+                           "--spec.layers", "5"])
+    config, params, source = macro._numbers(several)
+    assert (config.spec.layers, source) == (5, "paper_team any_team_mappo")
+    one, other = (Policy.load(paths.find(name, "policies", ".safetensors")).source.params
+                  for name in several.policy)
+    mean = jax.tree.map(lambda a, b: (a + b) / 2, one, other)
+    state = jax.vmap(world.reset)(jax.vmap(lambda k: draw(Draw(), k))(
+        jax.random.split(jax.random.key(0), 16)))
+    view = jax.vmap(look)(state, jnp.zeros(16))
+    said, as_before = (point(p, spec, view) for p, spec in (
+        (params, config.spec), (mean, PointerSpec())))
+    np.testing.assert_allclose(said.logits, as_before.logits, atol=1e-4)
+    np.testing.assert_allclose(said.value, as_before.value, atol=1e-4)
+    assert main(["train", "quick", "--policy", "paper_team", "unfolding", "--dry-run"]) == 2
+    assert "unfolding: policy: is of another size than paper_team" in capsys.readouterr().err
 
 
 def test_problems_are_drawn_as_the_grid_draws_them():
