@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from moonteam import files
 
 if TYPE_CHECKING:
-    from training.mappo.macro.config import MacroConfig
+    from training.mappo.macro.config import MacroConfig, Practice
     from training.teacher.imitation import Imitation
     from training.teacher.refinement import Refinement
 
@@ -43,20 +43,12 @@ def macro(config: MacroConfig, source: str) -> tuple[dict[str, Any], str]:
 
     families = []
     for one in config.families:
-        branched = one.advantages == "vine"
-        vine = config.grown(one)
-        episodes, steps = ((vine.episodes, vine.num_steps) if branched
-                           else (config.envs(one), config.hyper.num_steps))
-        families.append({
-            "family": one.name, "advantages": one.advantages, "maps": one.grounds,
-            "decisions": vine.moments if branched else episodes * steps,
-            "episodes": episodes, "num_steps": steps,
-            "gradient_steps": vine.epochs * vine.minibatches if branched
-            else config.hyper.epochs * config.hyper.minibatches})
+        families.append({"family": one.name, "advantages": one.advantages, "maps": one.grounds,
+                         **_round(config, one)})
     document = _document("MAPPO on macro-decisions", config, source, families,
                          _count(lambda key: pointer.init(config.spec, key)),
                          env_steps=config.rounds * config.decisions)
-    by = {"vine": "by branches", "critic": "by the critic"}
+    by = {"vine": "by branches", "critic": "by the critic", "tries": "by whole tries"}
     rows = [f"  {row['family']}: {row['decisions']:,} decisions a round, of {row['episodes']:,} x "
             f"{row['num_steps']} played, {by[row['advantages']]}, {row['gradient_steps']} gradient "
             "steps" for row in families]
@@ -68,6 +60,17 @@ def macro(config: MacroConfig, source: str) -> tuple[dict[str, Any], str]:
         f"{config.vine.options} options a branch, entropy {config.ent_coef:g}, {config.precision}",
         f"looked at: every {config.chunk_rounds * config.eval_every} rounds, "
         f"{config.eval_scenarios} held-out problems a family"])
+
+
+def _round(config: MacroConfig, family: Practice) -> dict[str, int]:
+    """What a round plays and learns of a family."""
+    if family.advantages == "critic":
+        rule, episodes, steps = config.hyper, config.envs(family), config.hyper.num_steps
+    else:
+        rule = config.grown(family) if family.advantages == "vine" else config.tried(family)
+        episodes, steps = rule.episodes, rule.num_steps
+    return {"decisions": config.moments(family), "episodes": episodes, "num_steps": steps,
+            "gradient_steps": rule.epochs * rule.minibatches}
 
 
 def taught(title: str, config: Imitation | Refinement, source: str, lead: str

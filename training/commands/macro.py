@@ -1,4 +1,4 @@
-"""`moonteam train quick|paper_team|any_team|unfolding`: MAPPO on macro-decisions."""
+"""`moonteam train quick|paper_team|any_team|any_team_further|..`: MAPPO on macro-decisions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from training.sharding import devices_here
 class Args(Together, Apart, Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
     on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one);
-    unfolding where not everything is known.
+    any_team_further goes on from it; unfolding where not everything is known.
 
     A decision is a target, held until something happens. Every number of the preset can be
     changed by an option.
@@ -42,7 +42,7 @@ class Args(Together, Apart, Watched):
       moonteam train paper_team --seeds 0 1 2 --out runs/team
       moonteam train paper_team --seeds 0 1 2 --out runs/team --on ray://head:10001
       moonteam train any_team --out runs/any --resume
-      moonteam train any_team --policy any_team --lr 3e-4 --rounds 300 --out runs/further
+      moonteam train any_team_further --policy any_team_mappo --out runs/further
     """
 
     config: Annotated[MacroConfig, tyro.conf.arg(name="")]
@@ -50,9 +50,10 @@ class Args(Together, Apart, Watched):
     seeds: tuple[int, ...] = ()
     """Several runs one after the other, or side by side with --on, each in OUT/SEED, then put side
     by side in OUT."""
-    policy: str = ""
+    policy: tuple[str, ...] = ()
     """Policy file (.safetensors) or the name of a bundled policy, of kind pointer, to go on from
-    instead of fresh weights."""
+    instead of fresh weights; of several of one size, the mean of their weights. With more
+    --spec.layers than it has, blocks are added that change nothing at first."""
 
 
 def parse(words: list[str]) -> Args:
@@ -149,13 +150,33 @@ def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
     """What a run is made from: numbers, weights to go on from if any, and where these are from."""
     if not args.policy:
         return args.config, None, ""
-    spec, params = _pointer(args.policy)
-    if args.config.spec.unfolds and not spec.unfolds:
-        from moonteam.policies import pointer
+    from moonteam.policies import pointer
 
+    spec, params = _mean(args.policy)
+    if args.config.spec.unfolds and not spec.unfolds:
         spec = dataclasses.replace(spec, unfolds=True)
         params = pointer.grafted(spec, params)
-    return dataclasses.replace(args.config, spec=spec), params, args.policy
+    if args.config.spec.layers > spec.layers:
+        params = pointer.deepened(spec, params, args.config.spec.layers)
+        spec = dataclasses.replace(spec, layers=args.config.spec.layers)
+    return dataclasses.replace(args.config, spec=spec), params, " ".join(args.policy)
+
+
+def _mean(names: tuple[str, ...]) -> tuple[Any, Any]:
+    """Size of pointer policies, and the mean of their parameters: those that went on from the same
+    one are often better together than each (Wortsman et al. 2022, "Model soups").
+
+    Raises InputError if they are of unlike sizes.
+    """
+    import jax
+    import numpy as np
+
+    found = [_pointer(name) for name in names]
+    spec = found[0][0]
+    for name, (other, _) in zip(names, found, strict=True):
+        if other != spec:
+            raise InputError(name, f"is of another size than {names[0]}: {other}, {spec}", "policy")
+    return spec, jax.tree.map(lambda *each: np.mean(each, axis=0), *(params for _, params in found))
 
 
 def _pointer(name: str) -> tuple[Any, Any]:

@@ -15,7 +15,7 @@ Legend: B batch, N agents, M targets, E = N + M tokens, S skills, D width, K hea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import jax
@@ -267,6 +267,20 @@ def grafted(spec: PointerSpec, params: Any) -> Any:
     the same policy.
     """
     return {**params, "ahead": init(spec, jax.random.key(0))["ahead"]}
+
+
+def deepened(spec: PointerSpec, params: Any, layers: int) -> Any:
+    """Parameters of a network with more blocks, the new ones last: it begins as the same policy."""
+    fresh = init(replace(spec, layers=layers), jax.random.key(0))
+    out = {**fresh, **params}
+    for name, own in fresh.items():
+        if name.startswith("bias_"):
+            out[name] = jax.tree.map(lambda new, old: jnp.zeros_like(new).at[
+                ..., :old.shape[-1]].set(old), own, params[name])
+        elif name.startswith("block") and name not in params:
+            out[name] = {part: jax.tree.map(jnp.zeros_like, value) if part in ("out", "down")
+                         else value for part, value in own.items()}
+    return out
 
 
 def init(spec: PointerSpec, key: Array) -> Any:

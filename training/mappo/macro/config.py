@@ -8,7 +8,7 @@ from typing import Literal
 from moonteam.errors import InputError
 from moonteam.grid.macro.draw import Draw
 from moonteam.policies.pointer import PointerSpec
-from training.mappo.macro.hyper import Hyper, Vine
+from training.mappo.macro.hyper import Hyper, Tries, Vine
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Practice:
     """P, maps with blocked cells made beforehand and drawn from; 0: open maps."""
     shrink: int = 1
     """Environments, or moments branched, are this many times fewer: large problems cost more."""
-    advantages: Literal["vine", "critic"] = "vine"
-    """From branches played out, or from the critic."""
+    advantages: Literal["vine", "critic", "tries"] = "vine"
+    """From branches played out, from the critic, or from whole tries of the same problem."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class MacroConfig:
     """Of an update."""
     vine: Vine = field(default_factory=Vine)
     """Of an update by branches."""
+    tries: Tries = field(default_factory=Tries)
+    """Of an update by whole tries."""
     spec: PointerSpec = field(default_factory=PointerSpec)
     """Size of the network."""
     lr: float = 2e-3
@@ -67,41 +69,49 @@ class MacroConfig:
                 raise InputError(self.macro, f"{getattr(self, key)} is not allowed; at least 1",
                                  key)
         for name, keys in (("hyper", ("num_steps", "epochs", "minibatches", "part")),
-                           ("vine", ("episodes", "moments", "epochs", "minibatches", "longest"))):
+                           ("vine", ("episodes", "moments", "epochs", "minibatches", "longest")),
+                           ("tries", ("problems", "epochs", "rows"))):
             for key in keys:
                 if (value := getattr(getattr(self, name), key)) < 1:
                     raise InputError(self.macro, f"{value} is not allowed; at least 1",
                                      f"{name}.{key}")
-        if self.vine.options < 2:
-            raise InputError(self.macro, f"{self.vine.options} is not allowed; at least 2 options",
-                             "vine.options")
-        if self.vine.tau <= 0.0:
-            raise InputError(self.macro, f"{self.vine.tau:g} is not allowed; above 0", "vine.tau")
+        for key, value in (("vine.options", self.vine.options), ("tries.each", self.tries.each)):
+            if value < 2:
+                raise InputError(self.macro, f"{value} is not allowed; at least 2", key)
+        for key, value in (("vine.tau", self.vine.tau), ("tries.heat", self.tries.heat)):
+            if value <= 0.0:
+                raise InputError(self.macro, f"{value:g} is not allowed; above 0", key)
         if not 0.0 < self.lr <= 0.1:
             raise InputError(self.macro, f"{self.lr:g} is not allowed; above 0, at most 0.1", "lr")
-        if not 0.0 < self.hyper.learned <= 1.0:
-            raise InputError(self.macro, f"{self.hyper.learned:g} is not allowed; above 0, at most "
-                             "1", "hyper.learned")
+        for key, value in (("hyper.learned", self.hyper.learned),
+                           ("tries.learned", self.tries.learned)):
+            if not 0.0 < value <= 1.0:
+                raise InputError(self.macro, f"{value:g} is not allowed; above 0, at most 1", key)
         for one in self.families:
-            if one.advantages == "vine":
-                self._check(one)
-                continue
-            rows = self.rows(one)
-            if self.envs(one) < 1 or rows < 1 or rows % self.hyper.minibatches:
-                raise InputError(
-                    self.macro, f"{self.hyper.minibatches} minibatches do not divide the {rows} "
-                    f"moments learned from of {self.envs(one)} environments x "
-                    f"{self.hyper.num_steps} decisions of {one.name}", "hyper.minibatches")
+            self._check(one)
 
     def _check(self, family: Practice) -> None:
-        """Of a family that is branched."""
-        vine = self.grown(family)
-        if vine.moments < 1 or vine.moments % vine.minibatches or (
-                vine.moments > vine.episodes * vine.num_steps):
-            raise InputError(self.macro, f"{vine.moments} moments of {family.name} are not "
-                             f"divided by {vine.minibatches} minibatches, are more than its "
-                             f"{vine.episodes} x {vine.num_steps} decisions, or none",
-                             "vine.moments")
+        """Whether there is enough of a family, and whether it can be parted."""
+        if family.advantages == "vine":
+            vine = self.grown(family)
+            if vine.moments < 1 or vine.moments % vine.minibatches or (
+                    vine.moments > vine.episodes * vine.num_steps):
+                raise InputError(self.macro, f"{vine.moments} moments of {family.name} are not "
+                                 f"divided by {vine.minibatches} minibatches, are more than its "
+                                 f"{vine.episodes} x {vine.num_steps} decisions, or none",
+                                 "vine.moments")
+        elif family.advantages == "tries":
+            tries = self.tried(family)
+            if tries.moments < 1:
+                raise InputError(self.macro, f"{tries.problems} problems of {family.name} leave "
+                                 "no moments to learn from", "tries.problems")
+        else:
+            rows = self.rows(family)
+            if self.envs(family) < 1 or rows < 1 or rows % self.hyper.minibatches:
+                raise InputError(
+                    self.macro, f"{self.hyper.minibatches} minibatches do not divide the {rows} "
+                    f"moments learned from of {self.envs(family)} environments x "
+                    f"{self.hyper.num_steps} decisions of {family.name}", "hyper.minibatches")
 
     def grown(self, family: Practice) -> Vine:
         """Of a family: fewer moments of large problems, in fewer minibatches of the same size."""
@@ -113,6 +123,11 @@ class MacroConfig:
                        moments=vine.moments // family.shrink,
                        minibatches=max(1, vine.minibatches // family.shrink))
 
+    def tried(self, family: Practice) -> Tries:
+        """Of a family: fewer large problems."""
+        return replace(self.tries, num_steps=self.tries.num_steps or 2 * family.draw.entries,
+                       problems=self.tries.problems // family.shrink)
+
     def envs(self, family: Practice) -> int:
         """Environments of a family."""
         return self.num_envs // family.shrink
@@ -121,11 +136,16 @@ class MacroConfig:
         """Moments of a family that a pass learns from."""
         return int(self.envs(family) * self.hyper.num_steps * self.hyper.learned)
 
+    def moments(self, family: Practice) -> int:
+        """Of a family in a round: those learned from, with the critic all that are decided."""
+        if family.advantages == "critic":
+            return self.envs(family) * self.hyper.num_steps
+        return (self.grown if family.advantages == "vine" else self.tried)(family).moments
+
     @property
     def decisions(self) -> int:
-        """Moments in a round from which is learned or that are decided, of all families."""
-        return sum(self.grown(f).moments if f.advantages == "vine"
-                   else self.envs(f) * self.hyper.num_steps for f in self.families)
+        """Moments in a round, of all families."""
+        return sum(self.moments(family) for family in self.families)
 
 
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())
@@ -161,6 +181,17 @@ PRESETS = {
         ),
         # Of many targets returns are long, and their squared error could drown the choices.
         rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5),
+}
+"""By the word behind `moonteam train`."""
+PRESETS["any_team_further"] = replace(
+    # Of many robots and targets whole tries say more than branches, and are cheap enough for more.
+    PRESETS["any_team"], macro="any_team_further", rounds=150, lr=2e-4,
+    # A deeper network, whose noise is averaged over longer: it goes on from a good one.
+    spec=PointerSpec(layers=5), hyper=replace(PRESETS["any_team"].hyper, ema=0.9995), families=(
+        *PRESETS["any_team"].families[:6],
+        *(replace(one, advantages="tries", shrink=one.shrink // 2)
+          for one in PRESETS["any_team"].families[6:])))
+PRESETS |= {
     "unfolding": MacroConfig(
         "unfolding", (
             Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),

@@ -12,7 +12,7 @@ from moonteam.policies.pointer import Outlook
 
 @dataclass(frozen=True)
 class Hyper:
-    """Of both kinds of update."""
+    """Of all kinds of update."""
 
     num_steps: int = 16
     """T, decisions of each environment between updates."""
@@ -80,3 +80,46 @@ class Vine:
     def over(self, devices: int) -> Vine:
         """The share of one of them."""
         return replace(self, episodes=self.episodes // devices, moments=self.moments // devices)
+
+
+@dataclass(frozen=True)
+class Tries:
+    """Of updates by whole tries, see `tries`."""
+
+    problems: int = 256
+    """I, drawn for an update; fewer of a family that shrinks."""
+    each: int = 16
+    """K, tries of each."""
+    heat: float = 0.5
+    """Temperature of the policy that is tried, and learned."""
+    num_steps: int = 0
+    """L, decisions after which a try is given up; 0: twice the most targets."""
+    learned: float = 0.1
+    """Share of the I x K x L decisions that is learned from, the undecided first."""
+    rows: int = 256
+    """Moments of a minibatch."""
+    epochs: int = 1
+    """Passes over the moments."""
+
+    @property
+    def episodes(self) -> int:
+        """I x K, played."""
+        return self.problems * self.each
+
+    @property
+    def minibatches(self) -> int:
+        """Of a pass."""
+        return max(1, self._learned // self.rows)
+
+    @property
+    def moments(self) -> int:
+        """S, learned from."""
+        return self._learned // self.minibatches * self.minibatches
+
+    @property
+    def _learned(self) -> int:
+        return int(self.episodes * self.num_steps * self.learned)
+
+    def over(self, devices: int) -> Tries:
+        """The share of one of them."""
+        return replace(self, problems=self.problems // devices)

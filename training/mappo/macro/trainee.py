@@ -19,13 +19,12 @@ from moonteam.policies.brain import PointerBrain
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import PolicyFile
 from moonteam.report.progress import say
-from training.mappo.macro import grounds
+from training.mappo.macro import grounds, tries, vine
 from training.mappo.macro.config import MacroConfig, Practice
 from training.mappo.macro.curve import draw_curve
 from training.mappo.macro.held_out import HeldOut
 from training.mappo.macro.learner import Learner
 from training.mappo.macro.update import Report, Walk, fresh, update
-from training.mappo.macro.vine import Grown, improve
 from training.run.families import mean
 from training.run.trainee import Made, Position, Row
 from training.sharding import everywhere, gather, mesh_for, spread
@@ -54,10 +53,12 @@ class MacroMappo:
         parts = config.hyper.minibatches
         met = [f for f in config.families if f.advantages == "critic"]
         grown = [config.grown(f) for f in config.families if f.advantages == "vine"]
+        tried = [config.tried(f) for f in config.families if f.advantages == "tries"]
         self.mesh = mesh_for([config.envs(f) for f in met]
                              + [config.rows(f) // parts for f in met]
                              + [v.moments // v.minibatches for v in grown]
-                             + [v.episodes for v in grown])
+                             + [v.episodes for v in grown]
+                             + [t.problems for t in tried])
         key = jax.random.key(config.seed)
         keys = jax.random.split(key, len(config.families) + 1)
         params = pointer.init(config.spec, keys[0]) if params is None else params
@@ -121,8 +122,11 @@ class MacroMappo:
         """The update on the config's family number i, and its arguments that are static."""
         config, family = self.config, self.config.families[i]
         fixed = self.mesh, config.spec, family.draw, config.hyper
-        return (update, fixed) if self.walks[i] is not None else (
-            improve, (*fixed, config.grown(family)))
+        if family.advantages == "critic":
+            return update, fixed
+        if family.advantages == "vine":
+            return vine.improve, (*fixed, config.grown(family))
+        return tries.improve, (*fixed, config.tried(family))
 
     def _given(self, i: int, key: Array, lr: np.float32, entropy: np.float32) -> tuple[Any, ...]:
         """Its other arguments."""
@@ -151,7 +155,7 @@ class MacroMappo:
         return Made(count, count * config.decisions, _summary(gather(reports)))
 
     def practise(self, i: int, family: Practice, key: Array, lr: np.float32,
-                 entropy: np.float32) -> Report | Grown:
+                 entropy: np.float32) -> Report | vine.Grown | tries.Compared:
         """One update on a family, which is the config's number i."""
         function, fixed = self._update(i)
         # Before `enter`, as on the bench, nothing is compiled.
@@ -244,7 +248,7 @@ class MacroMappo:
         draw_curve(path, {self.name: [rows]})
 
 
-def _summary(reports: list[Report | Grown]) -> dict[str, float]:
+def _summary(reports: list[Report | vine.Grown | tries.Compared]) -> dict[str, float]:
     """Means over a chunk's updates, each figure over those that have it.
 
     What is known of episodes or branches is weighed by how many there were.

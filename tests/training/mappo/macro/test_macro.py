@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from moonteam import paths
 from moonteam.cli import main
 from moonteam.errors import InputError
 from moonteam.grid.macro import world
@@ -17,10 +18,11 @@ from moonteam.policies.pointer import PointerSpec, look, point
 from moonteam.policies.policy import Policy
 from moonteam.policies.policy_file import load_policy
 from tests.killed import kill_when_saved
+from training.commands import macro
 from training.mappo.macro import grounds
 from training.mappo.macro.config import PRESETS, MacroConfig, Practice
 from training.mappo.macro.held_out import HeldOut, moment_of
-from training.mappo.macro.hyper import Hyper, Vine
+from training.mappo.macro.hyper import Hyper, Tries, Vine
 from training.mappo.macro.trainee import MacroMappo
 from training.mappo.macro.update import Batch, chosen, collect, fresh, loss
 from training.run import checkpoints, metrics
@@ -30,11 +32,13 @@ SPEC = PointerSpec(width=16, heads=2, layers=1, pairs=8)
 SMALL = Draw(agents=(2, 2), targets=(2, 2), sides=(6, 6), limit=60.0)
 HYPER = Hyper(num_steps=4, learned=0.5, minibatches=2)
 VINE = Vine(episodes=8, num_steps=4, moments=16, minibatches=2)
+TRIES = Tries(problems=8, each=3, rows=8)
 TINY = MacroConfig("quick", (Practice("small", SMALL, advantages="critic"),), rounds=3, num_envs=8,
-                   hyper=HYPER, vine=VINE, spec=SPEC, chunk_rounds=1, eval_every=1,
+                   hyper=HYPER, vine=VINE, tries=TRIES, spec=SPEC, chunk_rounds=1, eval_every=1,
                    eval_scenarios=32)
 BOTH = dataclasses.replace(
-    TINY, families=(*TINY.families, Practice("closed", SMALL, grounds=8, shrink=2)), rounds=6,
+    TINY, families=(*TINY.families, Practice("closed", SMALL, grounds=8, shrink=2),
+                    Practice("tried", SMALL, shrink=2, advantages="tries")), rounds=6,
     hyper=dataclasses.replace(HYPER, spread=True))
 SMALLER = ("from training.mappo.macro import config; "
            "from tests.training.mappo.macro.test_macro import BOTH; "
@@ -135,13 +139,14 @@ def test_a_better_choice_becomes_likelier(trainee, flat):
     assert np.asarray(after)[real].mean() > np.asarray(flat.log_prob)[real].mean()
 
 
-@pytest.mark.parametrize("advantages", ["critic", "vine"])
+@pytest.mark.parametrize("advantages", ["critic", "vine", "tries"])
 def test_training_learns(advantages):
     """A minute's worth of a toy: the held-out gap falls."""
     config = dataclasses.replace(
         TINY, families=(Practice("small", SMALL, advantages=advantages),), rounds=40, num_envs=64,
         chunk_rounds=40, lr=3e-3, hyper=dataclasses.replace(HYPER, num_steps=8, minibatches=4),
-        vine=Vine(episodes=64, num_steps=6, moments=128, minibatches=4))
+        vine=Vine(episodes=64, num_steps=6, moments=128, minibatches=4),
+        tries=Tries(problems=64, each=8, rows=64))
     trainee = MacroMappo(config)
     before = trainee.evaluate()[0]
     figures = trainee.chunk(Position("macro")).figures
@@ -263,10 +268,36 @@ def test_impossible_numbers(tmp_path, capsys):
     for key, value in (("tau", 0.0), ("minibatches", 0), ("episodes", 0)):
         with pytest.raises(InputError, match=rf"vine\.{key}: 0 is not allowed"):
             dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, **{key: value}))
-    with pytest.raises(InputError, match="2 options"):
+    for key, value in (("heat", 0.0), ("learned", 0.0), ("problems", 0), ("rows", 0)):
+        with pytest.raises(InputError, match=rf"tries\.{key}: 0 is not allowed"):
+            dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, **{key: value}))
+    with pytest.raises(InputError, match="1 problems of tried"):
+        dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, problems=2, learned=0.05))
+    with pytest.raises(InputError, match=r"vine\.options: 1 is not allowed; at least 2"):
         dataclasses.replace(BOTH, vine=dataclasses.replace(VINE, options=1))
+    with pytest.raises(InputError, match=r"tries\.each: 1 is not allowed; at least 2"):
+        dataclasses.replace(BOTH, tries=dataclasses.replace(TRIES, each=1))
     assert main(["train", "quick", "--policy", "small", "--out", str(tmp_path / "x")]) == 2
     assert "only pointer policies" in capsys.readouterr().err
+
+
+def test_it_goes_on_from_the_mean_of_policies_with_more_blocks_and_the_same_words(capsys):
+    several = macro.parse(["any_team", "--policy", "paper_team", "any_team_mappo",
+                           "--spec.layers", "5"])
+    config, params, source = macro._numbers(several)
+    assert (config.spec.layers, source) == (5, "paper_team any_team_mappo")
+    one, other = (Policy.load(paths.find(name, "policies", ".safetensors")).source.params
+                  for name in several.policy)
+    mean = jax.tree.map(lambda a, b: (a + b) / 2, one, other)
+    state = jax.vmap(world.reset)(jax.vmap(lambda k: draw(Draw(), k))(
+        jax.random.split(jax.random.key(0), 16)))
+    view = jax.vmap(look)(state, jnp.zeros(16))
+    said, as_before = (point(p, spec, view) for p, spec in (
+        (params, config.spec), (mean, PointerSpec())))
+    np.testing.assert_allclose(said.logits, as_before.logits, atol=1e-4)
+    np.testing.assert_allclose(said.value, as_before.value, atol=1e-4)
+    assert main(["train", "quick", "--policy", "paper_team", "unfolding", "--dry-run"]) == 2
+    assert "unfolding: policy: is of another size than paper_team" in capsys.readouterr().err
 
 
 def test_problems_are_drawn_as_the_grid_draws_them():
