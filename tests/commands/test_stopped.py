@@ -82,8 +82,10 @@ NUMBERS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 
 @NUMBERS
-def test_a_search_is_left(number):
-    child = Child(["plan", "8x40:0", "--planner", "lns", "--time-limit", "600"])
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_a_search_is_left(number, threads):
+    child = Child(["plan", "8x40:0", "--planner", "lns", "--time-limit", "600",
+                   "--threads", threads])
     check(child, lambda: child.worked() > 1.0, number)
 
 

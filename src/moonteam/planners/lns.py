@@ -10,6 +10,7 @@ import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Event
 
 import numpy as np
 
@@ -119,24 +120,28 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
       until: `time.perf_counter()` at which to stop.
       threads: searches side by side, each with the whole budget; the best counts.
     """
+    stop = Event()
     if threads == 1:
-        return _improved(task, goal, events, seed, iterations, until)
+        return _improved(task, goal, events, seed, iterations, until, stop)
     with ThreadPoolExecutor(threads) as pool:
-        found = pool.map(lambda k: _improved(task, goal, events, seed + k * _APART, iterations,
-                                             until), range(threads))
-        return min(found, key=lambda one: cost(task, goal, one))
+        try:
+            found = list(pool.map(lambda k: _improved(
+                task, goal, events, seed + k * _APART, iterations, until, stop), range(threads)))
+        finally:  # an interruption waits for none of them
+            stop.set()
+    return min(found, key=lambda one: cost(task, goal, one))
 
 
 _APART = 1_000_003  # between the seeds of searches side by side
 
 
 def _improved(task: Task, goal: Weights, events: Events, seed: int, iterations: int | None,
-              until: float | None) -> Events:
-    """`improve` in this thread."""
+              until: float | None, stop: Event) -> Events:
+    """`improve` in this thread, until somebody sets `stop`."""
     now, best, ways = events.copy(), events.copy(), _ways(task)
     began, done, room = time.perf_counter(), 0, _BLOCK if until is None else _FIRST
     cooling = math.log(_COLD / _HOT)
-    while len(task.targets) > 1 and iterations != 0:
+    while len(task.targets) > 1 and iterations != 0 and not stop.is_set():
         clock = time.perf_counter()
         shares = [done / iterations] if iterations is not None else []
         if until is not None:
