@@ -240,15 +240,14 @@ def contenders(options: Options) -> list[Contender]:
         options.of(preference=preference)
     for text in options.decodes:
         decoding.parse(text)
-    kinds = [registry.find(planner) for planner in dict.fromkeys(options.planners)]
-    if options.threads > 1 and not any(kind.parallel for kind in kinds):
+    kinds = {planner: registry.find(planner) for planner in options.planners}
+    if options.threads > 1 and not any(kind.parallel for kind in kinds.values()):
         raise InputError("--threads", NO_THREADS)
     found: list[Contender] = []
-    for planner in dict.fromkeys(options.planners):
-        kind = registry.find(planner)
+    for planner, kind in kinds.items():
         found += policies(options, given) if kind.name == POLICY else _planned(
             planner, kind, options, given or MAKESPAN)
-    if options.policies and not any(registry.find(p).wants_policy for p in options.planners):
+    if options.policies and not any(kind.wants_policy for kind in kinds.values()):
         raise InputError("--policy", f"has no effect without --planner {POLICY}")
     names = [one.name for one in found]
     for name in names:

@@ -151,47 +151,46 @@ class MacroConfig:
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())
 HYPER = Hyper(loose=0.2)
 
+ANY_TEAM = MacroConfig(
+    "any_team", (
+        PAPER,
+        Practice("3 unlike robots, 1 to 8 targets",
+                 Draw(targets=(1, 8), metric="either", unlike=0.8, service=1.0, numbers=2,
+                      homes=0.2, sides=(16, 48), limit=4000.0), shrink=2),
+        Practice("2 to 5 robots, 3 to 10 targets, 3 skills",
+                 Draw(agents=(2, 5), targets=(3, 10), num_skills=3, sides=(8, 64),
+                      metric="either", unlike=0.3, limit=4000.0), shrink=2),
+        Practice("3 robots, 4 to 7 targets, blocked",
+                 Draw(agents=(3, 3), targets=(4, 7), num_skills=2, unlike=0.3,
+                      limit=4000.0), grounds=2048, shrink=2),
+        Practice("4 to 8 robots, 3 to 10 targets, 3 skills",
+                 Draw(agents=(4, 8), targets=(3, 10), num_skills=3, sides=(16, 48),
+                      metric="either", unlike=0.3, limit=4000.0), shrink=4),
+        Practice("2 to 6 robots, 8 to 14 targets",
+                 Draw(agents=(2, 6), targets=(8, 14), sides=(16, 48), metric="either",
+                      unlike=0.3, limit=4000.0), shrink=8),
+        Practice("5 to 8 robots, 12 to 24 targets",
+                 Draw(agents=(5, 8), targets=(12, 24), num_skills=3, metric="either",
+                      unlike=0.3, limit=8000.0), shrink=32),
+        Practice("6 to 8 robots, 24 to 40 targets",
+                 Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
+                      limit=8000.0), shrink=64),
+    ),
+    # Of many targets returns are long, and their squared error could drown the choices.
+    rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5)
+
 PRESETS = {
     "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER),
     "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER),
-    "any_team": MacroConfig(
-        "any_team", (
-            PAPER,
-            Practice("3 unlike robots, 1 to 8 targets",
-                     Draw(targets=(1, 8), metric="either", unlike=0.8, service=1.0, numbers=2,
-                          homes=0.2, sides=(16, 48), limit=4000.0), shrink=2),
-            Practice("2 to 5 robots, 3 to 10 targets, 3 skills",
-                     Draw(agents=(2, 5), targets=(3, 10), num_skills=3, sides=(8, 64),
-                          metric="either", unlike=0.3, limit=4000.0), shrink=2),
-            Practice("3 robots, 4 to 7 targets, blocked",
-                     Draw(agents=(3, 3), targets=(4, 7), num_skills=2, unlike=0.3,
-                          limit=4000.0), grounds=2048, shrink=2),
-            Practice("4 to 8 robots, 3 to 10 targets, 3 skills",
-                     Draw(agents=(4, 8), targets=(3, 10), num_skills=3, sides=(16, 48),
-                          metric="either", unlike=0.3, limit=4000.0), shrink=4),
-            Practice("2 to 6 robots, 8 to 14 targets",
-                     Draw(agents=(2, 6), targets=(8, 14), sides=(16, 48), metric="either",
-                          unlike=0.3, limit=4000.0), shrink=8),
-            Practice("5 to 8 robots, 12 to 24 targets",
-                     Draw(agents=(5, 8), targets=(12, 24), num_skills=3, metric="either",
-                          unlike=0.3, limit=8000.0), shrink=32),
-            Practice("6 to 8 robots, 24 to 40 targets",
-                     Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
-                          limit=8000.0), shrink=64),
-        ),
-        # Of many targets returns are long, and their squared error could drown the choices.
-        rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5),
-}
-"""By the word behind `moonteam train`."""
-PRESETS["any_team_further"] = replace(
-    # Of many robots and targets whole tries say more than branches, and are cheap enough for more.
-    PRESETS["any_team"], macro="any_team_further", rounds=150, lr=2e-4,
-    # A deeper network, whose noise is averaged over longer: it goes on from a good one.
-    spec=PointerSpec(layers=5), hyper=replace(PRESETS["any_team"].hyper, ema=0.9995), families=(
-        *PRESETS["any_team"].families[:6],
-        *(replace(one, advantages="tries", shrink=one.shrink // 2)
-          for one in PRESETS["any_team"].families[6:])))
-PRESETS |= {
+    "any_team": ANY_TEAM,
+    "any_team_further": replace(
+        # A deeper network, whose noise is averaged over longer: it goes on from a good one.
+        ANY_TEAM, macro="any_team_further", rounds=150, lr=2e-4, spec=PointerSpec(layers=5),
+        hyper=replace(ANY_TEAM.hyper, ema=0.9995), families=(
+            *ANY_TEAM.families[:6],
+            # Of many robots and targets whole tries say more than branches, and are cheap enough.
+            *(replace(one, advantages="tries", shrink=one.shrink // 2)
+              for one in ANY_TEAM.families[6:]))),
     "unfolding": MacroConfig(
         "unfolding", (
             Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),
@@ -209,3 +208,4 @@ PRESETS |= {
         ),
         rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
 }
+"""By the word behind `moonteam train`."""

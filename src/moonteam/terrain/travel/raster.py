@@ -106,9 +106,13 @@ def fresh_slowness(site: Site, raster: Raster, limits: Limits) -> FloatMap:
     else:
         slope, step = ground_under(site, points, limits.footprint)
     able = _kept_clear(judge(site, points, limits, slope, step), raster)
-    slowing = limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
     with np.errstate(divide="ignore"):  # a kind may lose all of its speed
-        return np.where(able, 1.0 / (limits.speed * (1.0 - slowing)), np.inf)
+        return np.where(able, 1.0 / (limits.speed * _kept_speed(slope, limits)), np.inf)
+
+
+def _kept_speed(slope: FloatMap, limits: Limits) -> FloatMap:
+    """Share of its speed that a kind keeps on a slope."""
+    return 1.0 - limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
 
 
 def costs(site: Site, raster: Raster, limits: Limits, thrift: float) -> FloatMap:
@@ -120,8 +124,7 @@ def costs(site: Site, raster: Raster, limits: Limits, thrift: float) -> FloatMap
     slope, _ = ground_under(site, raster.points(), limits.footprint)
     slopes, joules = np.array(limits.joules).T
     energy = np.interp(slope, slopes, joules) / joules[0]
-    slowed = 1.0 - limits.slowing * np.minimum(slope / limits.max_slope, 1.0)
-    return 1.0 - thrift + thrift * energy * slowed
+    return 1.0 - thrift + thrift * energy * _kept_speed(slope, limits)
 
 
 def _kept_clear(able: BoolMap, raster: Raster) -> BoolMap:
