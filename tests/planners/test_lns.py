@@ -16,6 +16,7 @@ from moonteam.planners.lns import LnsPlanner
 from moonteam.planners.search import insertion
 from moonteam.planners.search.bounds import lower_bounds
 from moonteam.planners.search.task import Task
+from moonteam.planners.search.teams import teams_of
 from moonteam.planners.search.travel import travel_times
 from moonteam.problem.scenario import Agent, Scenario, Target
 
@@ -125,7 +126,7 @@ def test_parts_solved_exactly_raise_the_bound():
 def test_coalitions_are_those_of_the_plain_list():
     for seed in range(20):
         task = task_of(grid.generate(seed, num_agents=5, num_targets=6, num_skills=3))
-        teams = insertion.coalitions(task.start, task.skills, task.need, task.both)
+        teams = teams_of(task.start, task.skills, task.need, task.both)
         for t in range(len(task.targets)):
             those = range(teams.first[t], teams.first[t + 1])
             plain = sorted(sum(1 << a for a in team) for team in coalitions(task, t))
@@ -146,7 +147,7 @@ def test_inserting_one_event_costs_what_the_place_said():
         task = task_of(grid.generate(seed, num_agents=4, num_targets=8, blocked=GROUND))
         count = len(task.targets)
         ways = insertion.Ways(task.start, task.between, task.kinds)
-        teams = insertion.coalitions(task.start, task.skills, task.need, task.both)
+        teams = teams_of(task.start, task.skills, task.need, task.both)
         line = insertion.empty(ways, teams)
         line.order[:] = rng.permutation(count)
         line.crew[:] = [rng.integers(*teams.first[t:t + 2]) for t in line.order]

@@ -22,6 +22,7 @@ from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.exact import MAX_TARGETS
 from moonteam.planners.search import insertion, schedules
 from moonteam.planners.search.task import weights
+from moonteam.planners.search.teams import coalitions
 from moonteam.planners.search.travel import UNREACHABLE, distance_field
 
 OPTIMAL, FEASIBLE, INFEASIBLE, UNFINISHED = 0, 1, 2, 3
@@ -145,7 +146,7 @@ def _search_near(start, between, kinds, skills, need, both, alpha, beta, horizon
     """
     n, m = start.shape
     ways = insertion.Ways(start, between, kinds)
-    teams = insertion.coalitions(start, skills, need, both)
+    teams = coalitions(start, skills, need, both)
     line, other = insertion.empty(ways, teams), insertion.empty(ways, teams)
     every = np.arange(m).astype(np.int32)
     _, makespan, moves = insertion.insert_all(every.copy(), True, ways, teams, line, 0, alpha, beta,

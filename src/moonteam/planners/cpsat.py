@@ -22,8 +22,8 @@ from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.lns import Events, Weights, best_insertion, improve, measure
 from moonteam.planners.plans.follow import Answer, RoutePlanner
-from moonteam.planners.search.insertion import teams_of
 from moonteam.planners.search.task import Task, weights
+from moonteam.planners.search.teams import teams_of
 from moonteam.planners.search.travel import UNREACHABLE
 
 Arc = tuple[int, int, int]

@@ -20,8 +20,9 @@ from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search import insertion
 from moonteam.planners.search.bounds import lower_bounds
-from moonteam.planners.search.insertion import Teams, Ways
+from moonteam.planners.search.insertion import Ways
 from moonteam.planners.search.task import Task, value_of, weights
+from moonteam.planners.search.teams import Teams, teams_of
 
 MAX_AGENTS = 62
 """Coalitions are bit masks of 64 bits."""
@@ -102,7 +103,7 @@ def cost(task: Task, goal: Weights, events: Events) -> float:
 
 def best_insertion(task: Task, goal: Weights, hurry: bool = False) -> Events:
     """The better of the two insertions; in a hurry that with regret."""
-    teams = insertion.teams_of(task.start, task.skills, task.need, task.both)
+    teams = teams_of(task.start, task.skills, task.need, task.both)
     tries = [insert(task, goal, teams, regret) for regret in ((True,) if hurry else (True, False))]
     return min(tries, key=lambda events: cost(task, goal, events))
 

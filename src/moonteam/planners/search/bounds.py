@@ -11,8 +11,8 @@ import numpy as np
 
 from moonteam.compilation import njit
 from moonteam.planners.search import schedules
-from moonteam.planners.search.insertion import teams_of
 from moonteam.planners.search.task import Task
+from moonteam.planners.search.teams import teams_of
 from moonteam.planners.search.travel import UNREACHABLE
 
 ROUNDS = 300  # subgradient steps; more add little
