@@ -30,6 +30,7 @@ class Errand:
     expected: float  # s that the whole way takes
     until: float = 0.0  # mission second at which its service ends
     behind: bool = False  # it has been said that it is late
+    look: Floats | None = None  # [2] m, where it is to look from on its way
     watched: float = 0.0  # mission second at which its progress was last judged
     mark: Floats | None = None  # [2] m, where it was then
 

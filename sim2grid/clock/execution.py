@@ -3,7 +3,8 @@
 A `TimedExecution` is the twin of `loop.execution.Execution`, driven by the same `drive.run`: it
 says where each robot should go, is told how all of them moved, and puts the mission as a `Moment`
 to whoever decides whenever something has happened: a service has ended, a target has appeared or
-lapsed, a robot is lost, slowed, heard of again or behind its expectation, ground turns out closed.
+lapsed, a robot is lost, slowed, heard of again or behind its expectation, ground turns out closed,
+a hidden target is found, a robot has come to where it was to look from.
 In between nothing is decided. Arrival and loss follow from `loop.rules`.
 
 Legend: R robots, M targets, T samples of a look.
@@ -13,13 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from moonteam.planners.seconds.base import MS, NEVER, Moment, Service, enough
 from moonteam.planners.seconds.keeper import HOME, WAIT
+from moonteam.planners.unfolding.state import Order
+from moonteam.planners.unfolding.world import View
 from moonteam.problem.mission import Mission
 from moonteam.problem.scenario import Scenario
 from moonteam.robots.base import CONTROL_PERIOD
@@ -28,6 +31,7 @@ from sim2grid.clock.errand import Errand
 from sim2grid.clock.happenings import Happenings
 from sim2grid.clock.roads import Floats, Roads
 from sim2grid.clock.task import Task
+from sim2grid.clock.unfold import LOOK, Scouting, Unfolding
 from sim2grid.frame import Frame
 from sim2grid.loop import rules as law
 from sim2grid.loop.asked import Asked, Body
@@ -54,12 +58,28 @@ BEHIND, BEHIND_S = 1.5, 6.0
 WATCH_S = 10.0
 """Seconds after which a robot on its way must have come a part of what it can in that time."""
 
+SAME_M = 0.3
+"""m between two places to look from that are one."""
+
+AROUND = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)],
+                  float)
+"""Cells from a place that is closed at which a robot may look instead, times a ring."""
+
 ASTRAY = 0.5
 """Cells from its place beyond which a robot is not at its service any more."""
 
 
+SOON_S = 0.5
+"""Seconds before a robot is where it is to look from at which it is asked where to look next."""
+
+BEYOND_M = 3.0
+"""m that its way leads on beyond, lest it slow down there."""
+
+
 class Chooser(Protocol):
-    """Who decides: `keeper.Keeper` with a planner, or a policy."""
+    """Who decides: `keeper.Keeper` with a planner or a policy, or where missions unfold
+    `unfold.Scouting`, which is shown a `View` in place of a moment and may send to places.
+    """
 
     name: str
 
@@ -67,7 +87,7 @@ class Chooser(Protocol):
         """Starts a mission."""
         ...
 
-    def act(self, moment: Moment) -> npt.NDArray[np.int64]:
+    def act(self, moment: Any, /) -> Any:
         """[R] a target's number, HOME or WAIT, for every robot that is in no service."""
         ...
 
@@ -89,9 +109,10 @@ class TimedExecution:
         self.known.speeds = self.task.speeds
         self.roads = self._charted = roads
         self.planner = planner
-        self.question: Moment | None = None
+        self.question: Moment | View | None = None
         self.finished = False
         self.errands: list[Errand] = []
+        self.unfolding = Unfolding(self.task) if isinstance(planner, Scouting) else None
         self._happenings = Happenings(self)
         self._power = Power(self.asked, self.record.charges)
         self._due = True
@@ -131,6 +152,9 @@ class TimedExecution:
         self.known.start(self._positions(pose[None])[-1, :, :2])
         self.errands = [Errand.idle(xy, 0.0) for xy in self.known.xy]
         self.book.points = self.known.xy.copy()
+        if self.unfolding is not None:
+            self.unfolding.see(self.known.xy, self.known.xy, self.known.mask, 0.0)
+        self._happenings.apply()
         self.planner.reset(self.moment(), self.asked.seed)
         self._next()
 
@@ -172,25 +196,31 @@ class TimedExecution:
         for i in self._power.spend(known.mask, poses[-1, :, :2], power, propellant, seconds):
             self.lose(i, "battery")
         self._progress(poses[0, :, :2], poses[-1, :, :2], seconds)
+        if self.unfolding is not None:
+            self.unfolding.see(poses[0, :, :2], known.xy, known.mask, book.time)
         self._serve()
         self._happenings.apply()
         self._end_if_over()
         if not self.finished and self._due:
             self._next()
 
-    def answer(self, choices: npt.ArrayLike) -> None:
+    def answer(self, choices: Sequence[Order] | npt.NDArray[np.int64]) -> None:
         """Takes a choice [R] for every robot and sends those that are free to follow it."""
         moment, self.question = self.question, None
-        chosen = np.asarray(choices, np.int64)
+        places = {i: order for i, order in enumerate(choices) if isinstance(order, tuple)}
+        chosen = np.array([LOOK if i in places else int(order)  # type: ignore[arg-type]
+                           for i, order in enumerate(choices)], np.int64)
         book, known = self.book, self.known
-        if moment is not None and not self.record.decisions:
+        if isinstance(moment, Moment) and not self.record.decisions:
             plan = self.planner.expected(moment) or ()
             self.record.expected |= {one.target: one.end / MS for one in plan}
         self.record.decisions.append(Decision(
             book.decision, book.time, known.snapshot.cells.copy(), chosen.astype(np.int32),
             self.solved.copy()))
         for i in np.flatnonzero(self.choosing).tolist():
-            if chosen[i] != self.errands[i].choice:
+            if i in places:
+                self._look(i, np.array(places[i]))
+            elif chosen[i] != self.errands[i].choice:
                 self._choose(i, int(chosen[i]))
         book.decision += 1
 
@@ -223,7 +253,10 @@ class TimedExecution:
     def again(self, robot: int) -> None:
         """Looks for the robot's way anew from where it is."""
         errand = self.errands[robot]
-        if errand.phase == "going":
+        if errand.phase == "going" and errand.look is not None:
+            place, errand.look = errand.look, None
+            self._look(robot, place)
+        elif errand.phase == "going":
             self._send(robot, errand.choice, errand.place)
 
     def _positions(self, qpos: npt.NDArray) -> npt.NDArray:
@@ -246,7 +279,9 @@ class TimedExecution:
             self._end("unsolvable", f"the robots that are left cannot solve {names}"
                       + (f"; lost: {gone}" if gone else ""))
         elif (~self.solved).any() or any(e.phase == "free" for e in self.errands):
-            self.question = moment
+            self.question = moment if self.unfolding is None else self.unfolding.view(
+                moment, self.asked.frame.on_map(self.known.xy), self.known.speeds, self.errands,
+                self.book.time, self._happenings.coming)
 
     def _hopeless(self, moment: Moment) -> list[int]:
         """Open targets that have lapsed, or that nobody left can serve."""
@@ -286,6 +321,25 @@ class TimedExecution:
             self.roads, robot, choice, self.known.mask, self.known.xy, self.errands)
         assert place is not None
         self._send(robot, choice, place)
+
+    def _look(self, robot: int, place: Floats) -> None:
+        """Sends a robot by where it is to look from, or as near to that as it can be.
+
+        It need not stand still to see, so its way leads on beyond, where that is open.
+        """
+        errand, kind = self.errands[robot], self.task.kinds[robot]
+        if errand.phase == "going" and errand.look is not None and (
+                law.metres(errand.look - place) < SAME_M):
+            return
+        frame, here = self.asked.frame, self.asked.frame.on_map(self.known.xy[robot])
+        gap = float(law.metres(place - here))
+        beyond = place + (BEYOND_M / max(gap, SAME_M)) * (place - here)
+        near = [frame.on_map(place + ring * frame.cell_m * AROUND) for ring in (1.0, 2.0)]
+        for spots in (frame.on_map(np.stack([beyond, place])), *near):
+            for spot in spots[np.isfinite(self.roads.matrix(kind, here[None], spots)[0])][:1]:
+                self._send(robot, LOOK, spot)
+                self.errands[robot].look = place
+                return
 
     def _send(self, robot: int, choice: int, place: Floats) -> None:
         known, book, kind = self.known, self.book, self.task.kinds[robot]
@@ -329,11 +383,19 @@ class TimedExecution:
             if errand.phase != "going" or not known.mask[i]:
                 continue
             done = errand.drive(known.xy[i])
+            if errand.look is not None and (law.metres(known.xy[i] - errand.look)
+                                            < SOON_S * known.speeds[i] + rules.arrive_cells):
+                self.ask()
             if there[i] and len(errand.points) <= 2:
                 self.book.close(i, "arrived")
                 self._note_end(i)
                 known.stalls[i] = 0
                 errand.phase = "there"
+                if errand.choice == LOOK:
+                    if (leg := self.book.legs[i]) is not None:
+                        leg.end_cell = leg.goal_cell  # no cell was asked for
+                    self.errands[i] = Errand.idle(known.xy[i], self.book.time)
+                    self.ask()
             elif done:
                 self.book.close(i, "arrived")
                 if (leg := self.book.legs[i]) is not None:
@@ -443,7 +505,7 @@ class TimedExecution:
         if self.finished:
             return
         away = self._away()
-        done = self.solved.all() and not self._happenings.bring_targets
+        done = self.solved.all() and not self._happenings.coming
         if done and not away:
             self._end(None, "")
         elif done and away == self._cut_off():
@@ -453,7 +515,9 @@ class TimedExecution:
             names = ", ".join(self.asked.mission.robots[i].name for i in away)
             self._end("unsolvable", f"no way leads {names} home")
         elif self.book.time >= self.asked.mission.max_seconds - 1e-6:
-            left = ", ".join(self.task.names[j] for j in np.flatnonzero(~self.solved))
+            names = [self.task.names[j] for j in np.flatnonzero(~self.solved)]
+            coming = self._happenings.coming
+            left = ", ".join(names + ([f"{coming} still to come"] if coming else []))
             self._end("max_seconds", (f"{left} not solved" if left else "not everybody is home")
                       + f" within {self.asked.mission.max_seconds:g} s")
 

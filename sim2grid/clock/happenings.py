@@ -1,4 +1,9 @@
-"""What a mission by the clock has in store: its events, and targets that appear and lapse."""
+"""What a mission by the clock has in store: its events, and targets that appear and lapse.
+
+Targets come by the clock, when so many others are solved, or once a robot that sees is near them.
+
+Legend: R robots.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from moonteam.planners.seconds.base import Bools
 from moonteam.problem.mission import Event
 from sim2grid.clock.roads import Floats
 from sim2grid.clock.task import Task
@@ -13,6 +19,7 @@ from sim2grid.loop.asked import Asked
 from sim2grid.loop.known import Known
 from sim2grid.loop.logbook import Logbook
 from sim2grid.loop.record import LossCause, ReplanCause
+from sim2grid.loop.rules import metres
 
 
 class UnderWay(Protocol):
@@ -22,6 +29,11 @@ class UnderWay(Protocol):
     known: Known
     book: Logbook
     task: Task
+
+    @property
+    def solved(self) -> Bools:
+        """[M] targets whose services have ended."""
+        ...
 
     def ask(self, cause: ReplanCause | None = None) -> None:
         """A decision is due."""
@@ -46,7 +58,11 @@ class Happenings:
     def __init__(self, execution: UnderWay):
         self._its = execution
         mission = execution.asked.mission
-        self._left = sorted(mission.events, key=lambda event: event.at_s or 0.0)
+        timed = [event for event in mission.events if not event.at_solved and not event.on_sight]
+        self._left = sorted(timed, key=lambda event: event.at_s or 0.0)
+        self._following = [event for event in mission.events if event.at_solved]
+        self._hidden = [event for event in mission.events if event.on_sight]
+        self._sensors = np.array([robot.sensor_m or -np.inf for robot in mission.robots])
         self._names = [robot.name for robot in mission.robots]
         self._windows: list[tuple[float, str]] = []
         for target in mission.targets:
@@ -54,9 +70,10 @@ class Happenings:
         self.silent_until = np.zeros(len(mission.robots))  # [R] mission seconds
 
     @property
-    def bring_targets(self) -> bool:
-        """Whether a target is still to come."""
-        return any(event.target for event in self._left)
+    def coming(self) -> int:
+        """Targets that are still to come."""
+        return sum(event.target is not None
+                   for event in (*self._left, *self._following, *self._hidden))
 
     def apply(self) -> None:
         """All that is due by now."""
@@ -67,6 +84,8 @@ class Happenings:
             self._its.ask("heard_again")
         while self._left and (self._left[0].at_s or 0.0) <= now + 1e-6:
             self._one(self._left.pop(0))
+        self._follow()
+        self._find()
         while self._windows and self._windows[0][0] <= now + 1e-6:
             self._its.ask("appeared" if self._windows.pop(0)[1] == "appears" else "lapsed")
 
@@ -77,7 +96,24 @@ class Happenings:
             self._windows.append((lapses + 0.01, "lapses"))
         self._windows.sort()
 
-    def _one(self, event: Event) -> None:
+    def _follow(self) -> None:
+        """Targets that come when so many others are solved."""
+        solved = int(self._its.solved.sum())
+        for event in [event for event in self._following if event.at_solved <= solved]:
+            self._following.remove(event)
+            self._one(event)
+
+    def _find(self) -> None:
+        """Hidden targets that a robot of the team sees."""
+        its = self._its
+        for event in [*self._hidden]:
+            assert event.target is not None
+            gap = metres(its.known.xy - its.task.place(event.target.at))
+            if (its.known.mask & (gap <= self._sensors)).any():
+                self._hidden.remove(event)
+                self._one(event, "found")
+
+    def _one(self, event: Event, cause: ReplanCause = "new_target") -> None:
         its = self._its
         if event.lost is not None and its.known.mask[self._names.index(event.lost)]:
             its.lose(self._names.index(event.lost), "event")
@@ -88,7 +124,7 @@ class Happenings:
             known = its.known
             known.snapshot = its.asked.with_targets(known.snapshot, [event.target])
             self._watch(event.target.appears, event.target.lapses)
-            its.ask("new_target")
+            its.ask(cause)
         if event.slow is not None:
             robot = self._names.index(event.slow.robot)
             its.known.speeds[robot] = event.slow.factor * its.task.speeds[robot]

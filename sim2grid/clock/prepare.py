@@ -5,11 +5,18 @@ from __future__ import annotations
 import msgspec
 
 from moonteam.errors import InputError
+from moonteam.planners.seconds.base import TimedPlanner
+from moonteam.planners.seconds.keeper import MARGIN_MS, Keeper
+from moonteam.planners.unfolding.make import PLACES, Search, check_search, decider_of, pointing
 from moonteam.problem.mission import Mission
 from moonteam.robots import team
 from moonteam.terrain.travel import Roads
 from sim2grid.clock.execution import Chooser, TimedExecution
+from sim2grid.clock.unfold import Scouting
 from sim2grid.loop.prepare import Prepared
+
+NEAR_M = 1.0
+"""m from where it was to look from at which a body can be sent on; it is asked a little before."""
 
 
 def by_the_clock(mission: Mission, source: object) -> Mission:
@@ -18,6 +25,33 @@ def by_the_clock(mission: Mission, source: object) -> Mission:
         raise InputError(source, "say when by at_s, with clock: seconds; decisions are "
                          "counted only where the clock is steps", "events")
     return msgspec.structs.replace(mission, clock="seconds")
+
+
+def choosing(planner: TimedPlanner, mission: Mission, search: Search | None = None,
+             futures: int = 0, seed: int = 0) -> Chooser:
+    """Who decides by the clock with this planner; `search` and `futures` where missions unfold.
+
+    Hidden targets are looked for on the nearest ground not seen yet, where nothing else is said.
+    Raises InputError for what means nothing in this mission.
+    """
+    if not mission.unfolds:
+        for option, given in (("--search", search), ("--futures", futures)):
+            if given:
+                raise InputError(option, f"has no effect in {mission.name or 'the mission'}, which "
+                                 "says nothing of what nobody knows yet (expects, on_sight, "
+                                 "at_solved)")
+        return Keeper(planner)
+    if search:
+        check_search(search, mission.searches)
+    if mission.searches and search is None:
+        search = PLACES if futures and pointing(planner) else "nearest"
+    if futures and search == PLACES and not pointing(planner):
+        raise InputError("--search places", "over futures is for policies; give another pattern")
+    expects = mission.expects
+    certain = expects is None or (expects.loss is None and not expects.scatter)
+    return Scouting(planner.name, decider_of(
+        planner, search=search or "", futures=futures, seed=seed, certain=certain,
+        margin_ms=MARGIN_MS, near_m=NEAR_M))
 
 
 def roads_of(prepared: Prepared) -> Roads:

@@ -33,9 +33,12 @@ if TYPE_CHECKING:
     from sim2grid.study.fleet import Given, Recipe
 
 DRAWN = ("team", "site", "sites", "count", "cell", "lose", "slow", "silent", "new_targets",
-         "impassable", "site_seed", "targets", "side", "max_steps", "ground", "soil", "fields",
+         "impassable", "unfold", "site_seed", "targets", "side", "max_steps", "ground", "soil",
+         "fields",
          *(field.name for field in fields(Elevation)))
 """Options of random missions, which a mission that is given answers itself."""
+
+MOST_FUTURES = 4096
 
 FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")
 """In --out."""
@@ -67,6 +70,7 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
       moonteam evaluate execution --team scout.py:SCOUT:A,rover.py:ROVER:AB --planner my.py:Planner
       moonteam evaluate execution --dem moon.tif --units degrees --centre -89.4 222 --side 24
       moonteam evaluate execution --site highland --sites 64 --count 256 --width 256
+      moonteam evaluate execution --mode clock --unfold hidden --planner exact --search sweep
       moonteam evaluate execution --count 500 --on ray://head:10001 --out runs/many
     """
 
@@ -111,6 +115,17 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     """New targets that appear in mid-mission, each at a random decision."""
     impassable: int = 0
     """Cells on the way of a robot on the ground that turn out closed to its kind."""
+    unfold: Literal["following", "arrivals", "hidden", "losses"] | None = None
+    """Missions by the clock in which not everything is known (--mode clock): five more targets,
+    each when one is solved, or by the clock, 10 s apart in the mean; all targets hidden until a
+    robot is within 6 m; or in one mission of three a robot is lost within 40 s."""
+    search: tuple[Literal["nearest", "sweep", "places", "stay", "middle"], ...] = ()
+    """Where targets are hidden: nearest, to the nearest ground not seen yet; sweep, up and down a
+    strip each; places, to look from, planned for as if they were targets (lns, policy); default:
+    nearest. Where they come: stay (default), or middle, where who has nothing to do goes to where
+    the next target is soonest reached in the mean. A row each."""
+    futures: tuple[int, ...] = ()
+    """Where missions unfold: every row again, decided over so many sampled futures."""
     backend: tuple[Literal["native", "mjx", "fused"], ...] = ("native",)
     """Physics engines: C MuJoCo, MJX for accelerators, or the whole loop on MJX as one program
     (closed loop, barrier, a policy's likeliest actions, no events); or several."""
@@ -186,10 +201,21 @@ def _check(args: Args) -> None:
         ("width", 1, 4096), ("threads", 0, 1024),
         ("new_targets", 0, 64), ("impassable", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1),
         ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
+    if args.unfold is not None:
+        if {*args.mode} != {"clock"} or {*args.loop} != {"closed"}:
+            raise InputError("--unfold", "its missions are by the clock; --mode clock --loop "
+                             "closed alone executes them")
+        for name in ("lose", "slow", "silent", "new_targets", "impassable"):
+            if getattr(args, name):
+                raise InputError(command.flag(name), "comes at decisions; --unfold says by the "
+                                 "clock what happens")
+    for count in args.futures:
+        if not 2 <= count <= MOST_FUTURES:
+            raise InputError("--futures", f"{count} is not allowed; 2 to {MOST_FUTURES}")
 
 
 def _evaluation(args: Args, given: list[Given]) -> Evaluation:
-    from sim2grid.study.evaluation import Evaluation, contenders, deciders
+    from sim2grid.study.evaluation import Evaluation, contenders, deciders, unfolded
 
     recipes = given or _recipes(args)
     # The plans of these loops are made in steps, whatever the modes of the others.
@@ -197,6 +223,7 @@ def _evaluation(args: Args, given: list[Given]) -> Evaluation:
     who = [deciders(name, args.planner_options(), modes) for name in args.planner]
     rows = contenders(args.loop, args.mode, [steps for steps, _ in who if steps], args.backend,
                       [timed for _, timed in who if timed])
+    rows = unfolded(rows, args.search, args.futures)
     if not rows:
         raise InputError("--planner", f"nobody of {', '.join(args.planner)} decides in these modes "
                          "and loops")
@@ -230,7 +257,7 @@ def _recipes(args: Args) -> list[Recipe]:
     # The exact planner, whose plans say which missions can be, takes 6 robots.
     return [Recipe(name, args.site_seed, args.seed, args.targets, args.side, args.cell,
                    args.max_steps, rates, team, "exact" if len(team) <= 6 else "greedy", skills,
-                   ground, args.sites) for name, ground in grounds]
+                   ground, args.sites, args.unfold) for name, ground in grounds]
 
 
 def _given(args: Args, made: Sequence[Mission]) -> list[Given]:
@@ -263,8 +290,9 @@ def _options(args: Args) -> dict[str, Any]:
         options["dem"] = os.fspath(args.dem)
     if args.mission:
         options["count"] = 1  # of each
-    if args.sites == 1:
-        del options["sites"]
+    for name in ("sites", "unfold", "search", "futures"):  # reports of before had none of them
+        if getattr(args, name) == getattr(Args(), name):
+            options.pop(name, None)
     rates = {name: options.pop(name)
              for name in ("lose", "slow", "silent", "new_targets", "impassable")}
     return options | {"rates": rates}

@@ -43,6 +43,7 @@ FILES = ("report.html", "video.mp4", "video.webp", "video.gif", "map.mp4", "map.
          "config.json")
 """In --out."""
 MOST_ROWS = 1000
+MOST_FUTURES = 4096
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,14 @@ class Args(Filmed, Planning, Forced, Printed):
     """barrier: all robots decide together; async: each decides when it arrives; clock: a decision
     is a target, planned in seconds and driven at any angle. Default: clock
     where the mission says clock: seconds, else barrier."""
+    search: Literal["nearest", "sweep", "places", "stay", "middle"] | None = None
+    """Where targets are hidden: nearest, to the nearest ground not seen yet; sweep, up and down a
+    strip each; places, to look from, planned for as if they were targets (lns, policy). Default:
+    nearest. Where they come: stay (default), or middle, where who has nothing to do goes to where
+    the next target is soonest reached in the mean."""
+    futures: int = 0
+    """Where missions unfold: decides over so many sampled futures; 0 looks no further than what is
+    known."""
     backend: Literal["mjx", "native", "fused"] | None = None
     """Physics engine: native (C MuJoCo), mjx (MuJoCo in JAX), or fused, the whole loop on MJX as
     one program, for a policy's likeliest actions in barrier mode. Default: native where JAX
@@ -102,8 +111,8 @@ class Args(Filmed, Planning, Forced, Printed):
     """Show the mission in a live 3-D window while it runs; needs a display."""
 
 
-FROM_REPORT = ("planner", "policy", "decode", "objective", "alpha", "beta", "time_limit",
-               "preference", "mode", "backend", "seed", "row")
+FROM_REPORT = ("planner", "search", "futures", "policy", "decode", "objective", "alpha", "beta",
+               "time_limit", "preference", "mode", "backend", "seed", "row")
 """Options that a report answers for its missions."""
 
 
@@ -353,6 +362,8 @@ def _check(args: Args) -> None:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
     parse(args.decode)
     filming.check(args)
+    if args.futures and not 2 <= args.futures <= MOST_FUTURES:
+        raise InputError("--futures", f"{args.futures} is not allowed; 2 to {MOST_FUTURES}, or 0")
     if args.row is not None and not 0 <= args.row[0] < args.row[1] <= MOST_ROWS:
         raise InputError("--row", f"{args.row[0]} {args.row[1]} is not allowed; a row from 0, and "
                          f"how many there are, at most {MOST_ROWS}")
@@ -395,6 +406,9 @@ def _from_file(args: Args) -> Run:
     if mission.clock == "seconds":
         raise InputError(source, "is by the clock, which --mode clock alone executes",
                          "clock")
+    for option, given in (("--search", args.search), ("--futures", args.futures)):
+        if given:
+            raise InputError(option, "is for missions by the clock that unfold")
     name = args.planner or "policy"
     planner = registry.make(name, args.planner_options())
     prepared = prepare(mission, source)
@@ -428,8 +442,7 @@ def _with_engine(args: Args) -> tuple[Args, str]:
 def _by_the_clock(args: Args, mission: Mission, why: str) -> Run:
     """The run of a mission by the clock. Raises InputError for whatever it cannot be."""
     from moonteam.planners.seconds import registry
-    from moonteam.planners.seconds.keeper import Keeper
-    from sim2grid.clock.prepare import by_the_clock, execution_of
+    from sim2grid.clock.prepare import by_the_clock, choosing, execution_of
     from sim2grid.loop.prepare import prepare
     from sim2grid.measure import optimum
 
@@ -438,13 +451,19 @@ def _by_the_clock(args: Args, mission: Mission, why: str) -> Run:
     _check(replace(args, planner=name, mode="clock"))
     prepared = prepare(by_the_clock(mission, source), source)
     planner = registry.find(name).make(args.planner_options(args.seed))
-    execution = execution_of(prepared, Keeper(planner), args.seed)
-    who = name if name != "policy" else f"policy {Path(args.policy).stem}"
+    who = choosing(planner, prepared.mission, args.search, args.futures, args.seed)
+    execution = execution_of(prepared, who, args.seed)
+    words = name if name != "policy" else f"policy {Path(args.policy).stem}"
+
+    def best() -> Optimum | None:
+        """Of what is known at the start; where more comes it means nothing."""
+        return None if mission.unfolds else optimum.in_seconds(
+            name, args.planner_options(args.seed), execution.task.first(execution.roads))
+
     return Run(prepared, execution, prepared.scene.qpos0, None, name,
                None if name == "policy" else args.objective, args.backend or "", args.seed,
-               f"{mission.name}: {who}, by the clock", command.line("rollout", args),
-               row=args.row or (0, 1), why=why, best=lambda: optimum.in_seconds(
-                   name, args.planner_options(args.seed), execution.task.first(execution.roads)))
+               f"{mission.name}: {words}, by the clock", command.line("rollout", args),
+               row=args.row or (0, 1), why=why, best=best)
 
 
 def _from_report(args: Args) -> Run:

@@ -84,7 +84,7 @@ class Session:
     @property
     def moment(self) -> Moment:
         """The mission as it stands."""
-        return self.execution.question or self.execution.moment()
+        return self.execution.moment()
 
     def play(self, choices: npt.ArrayLike | Sequence[int]) -> None:
         """To the next decision, or the end.
@@ -95,7 +95,7 @@ class Session:
         execution, still_s = self.execution, 0.0
         if execution.finished:
             return
-        execution.answer(choices)
+        execution.answer(np.asarray(choices, np.int64))
         while not execution.finished and execution.question is None:
             before = execution.book.time
             self._rows.advance()

@@ -22,7 +22,7 @@ from sim2grid.loop.power import Charge
 Ending = Literal["arrived", "timeout", "lost", "cut"]
 LossCause = Literal["fallen", "stuck", "not_a_number", "off_the_map", "battery", "event"]
 ReplanCause = Literal["timeout", "wrong_cell", "robot_lost", "new_target", "slowed", "silent",
-                      "heard_again", "impassable", "behind", "appeared", "lapsed"]
+                      "heard_again", "impassable", "behind", "appeared", "lapsed", "found"]
 FailureCause = Literal["max_steps", "max_seconds", "unsolvable", "plan_over", "engine",
                        "interrupted"]
 

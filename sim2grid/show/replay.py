@@ -32,6 +32,7 @@ from moonteam.planners.seconds.keeper import HOME, WAIT
 from moonteam.problem.scenario import ACTIONS
 from moonteam.robots.base import RobotKind
 from moonteam.terrain.site import Site
+from sim2grid.clock.unfold import LOOK
 from sim2grid.loop.prepare import Prepared
 from sim2grid.loop.record import SETTING_OUT, Leg
 from sim2grid.measure.slip import ground_height, slip
@@ -283,7 +284,7 @@ def _choices(story: Story, i: int, legs: list[Leg]) -> list[tuple[float, str]]:
     """When the robot was told something else, and what, for a person."""
     record, said = story.record, []
     if legs and legs[0].expected_s is not None:
-        names = {WAIT: "waits", HOME: "goes home"}
+        names = {WAIT: "waits", HOME: "goes home", LOOK: "looks"}
         names |= {j: f"goes for {name}" for j, name in enumerate(record.target_names)}
         # In a service nobody follows what is decided for later.
         busy = [(s.time_s - record.targets[s.target].service, s.time_s)

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -36,15 +36,16 @@ from moonteam.planners import registry
 from moonteam.planners.base import Objective, Planner
 from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
-from moonteam.planners.seconds.base import MS
+from moonteam.planners.seconds.base import MS, Moment
 from moonteam.planners.seconds.keeper import Keeper
+from moonteam.planners.unfolding.make import PLACES, Search
 from moonteam.policies.brain import PointerBrain
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
 from moonteam.robots import team
 from moonteam.terrain.travel import Roads
-from sim2grid.clock.execution import TimedExecution
-from sim2grid.clock.prepare import by_the_clock
+from sim2grid.clock.execution import Chooser, TimedExecution
+from sim2grid.clock.prepare import by_the_clock, choosing
 from sim2grid.loop.asked import Mode, Route
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
@@ -81,6 +82,8 @@ class Contender(msgspec.Struct, frozen=True):
     beta: float = 0.05
     time_limit: float | None = None  # seconds a plan, of anytime planners
     preference: float = 0.0  # of a policy
+    search: Search | None = None  # by the clock, where targets are hidden
+    futures: int = 0  # by the clock, where missions unfold: over how many it decides
 
     @classmethod
     def of(cls, planner: str, options: PlannerOptions, by_the_clock: bool = False) -> Contender:
@@ -121,6 +124,8 @@ class Contender(msgspec.Struct, frozen=True):
         The engine is named where it is not the native one.
         """
         words = [self.loop] + ([self.who] if self.loop != "oracle" else [])
+        words += [f"over {self.futures} futures"] if self.futures else []
+        words += [self.search] if self.search else []
         words += [self.mode] if self.loop in ("closed", "oracle") else []
         return " ".join(words + ([self.backend] if self.backend != "native" else []))
 
@@ -192,6 +197,10 @@ class Evaluation:
         self.entries = [Entry(index * self.count + k, draws, fleet.entry(k))
                         for index, fleet in enumerate(self._fleets)
                         for k, draws in enumerate(fleet.draws)]
+        unlike = {(m.unfolds, m.searches): m for fleet in self._fleets for m in fleet.missions}
+        for contender, mission in itertools.product(self.contenders, unlike.values()):
+            if contender.mode == "clock":
+                chooser(contender, mission)
 
     def run(self) -> None:
         """Runs what is not done yet. Raises InputError before a mission that cannot be run."""
@@ -338,8 +347,9 @@ class Group:
         fleet = self._fleet
         bodies = fleet.bodies if settling else [replace(body, settle=0.0) for body in fleet.bodies]
         mission = by_the_clock(fleet.missions[k], "--mode clock")
-        return TimedExecution(mission, fleet.scenarios[k], chooser(contender), bodies,
-                              fleet.frame, self._roads_of(k), seed=self._seed(k))
+        return TimedExecution(
+            mission, fleet.scenarios[k], chooser(contender, mission, self._seed(k)), bodies,
+            fleet.frame, self._roads_of(k), seed=self._seed(k))
 
     def _roads_of(self, k: int) -> Roads:
         """The ways over mission `k`'s ground."""
@@ -357,9 +367,11 @@ class Group:
         for k in todo:
             execution = self._by_the_clock(contender, k, settling=False)
             execution.start(self._fleet.starts[k])
-            assert execution.question is not None
-            execution.planner.act(execution.question)
-            plan = cast(Keeper, execution.planner).plan
+            plan, now = None, execution.question
+            # Where missions unfold nothing is promised.
+            if isinstance(execution.planner, Keeper) and isinstance(now, Moment):
+                execution.planner.act(now)
+                plan = execution.planner.plan
             expected = None if plan is None or plan.makespan is None else plan.makespan / MS
             found[k] = Promise(None, expected)
         return found
@@ -458,14 +470,27 @@ def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) ->
                   route_of(record, starts))
 
 
+def unfolded(rows: Sequence[Contender], searches: Sequence[Search], futures: Sequence[int]
+             ) -> list[Contender]:
+    """Rows by the clock in missions that unfold: by every way to search, and over futures too."""
+    found = []
+    for row, search in itertools.product(rows, searches or (None,)):
+        for count in (0, *futures):
+            # Over futures places are looked from by policies alone.
+            if not (count and search == PLACES and row.planner != "policy"):
+                found.append(msgspec.structs.replace(row, search=search, futures=count))
+    return found
+
+
 def maker(contender: Contender) -> Callable[[], Planner]:
     """Makes the planners of a contender. Raises InputError."""
     return registry.maker(contender.planner, contender.options)
 
 
-def chooser(contender: Contender) -> Keeper:
-    """Who decides for a contender by the clock. Raises InputError."""
-    return Keeper(timed_planners.find(contender.planner).make(contender.options))
+def chooser(contender: Contender, mission: Mission, seed: int = 0) -> Chooser:
+    """Who decides for a contender by the clock in a mission. Raises InputError."""
+    planner = timed_planners.find(contender.planner).make(contender.options)
+    return choosing(planner, mission, contender.search, contender.futures, seed)
 
 
 def deciders(name: str, options: PlannerOptions, modes: Sequence[Mode]

@@ -14,6 +14,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -25,6 +26,7 @@ from moonteam.loading import decode_mission, load_mission
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.planners import registry, simulate
 from moonteam.planners.base import IntArray, Plan, Snapshot, WholePlanner
+from moonteam.planners.unfolding.draw import EVERY_S, LOSS, SENSOR_M
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import (
     Event,
@@ -38,6 +40,7 @@ from moonteam.problem.mission import (
     Target,
 )
 from moonteam.problem.scenario import MAX_SKILLS, MOST_AGENTS, Scenario
+from moonteam.problem.timed import Prospect
 from moonteam.robots import KINDS, OWN, RobotKind, team
 from moonteam.terrain.site import Site as Ground
 from moonteam.terrain.site import for_mission
@@ -55,6 +58,13 @@ TEAM: tuple[tuple[str, str], ...] = tuple(
 MOST_DRAWS = 10_000
 SLOW_FACTORS = (0.3, 0.7)
 SILENT_DECISIONS = (5, 15)
+
+Unfold = Literal["following", "arrivals", "hidden", "losses"]
+"""What nobody knows yet in random missions: targets that come when others are solved, or by the
+clock; targets that are hidden; a robot that is lost.
+"""
+MORE = 5
+"""Targets that come, beside those that are known."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -87,6 +97,8 @@ class Recipe:
     skills: tuple[tuple[str, ...], ...] = ()  # of each robot; those of one with none are drawn
     ground: Site | None = None  # in place of the preset, which then is but its name
     sites: int = 1  # seeds of the ground, from site_seed on, which its missions go round
+    unfold: Unfold | None = None  # then they are by the clock
+    max_seconds: float = 600.0  # of those
 
     @property
     def site(self) -> Site:
@@ -106,7 +118,7 @@ class Recipe:
 
     def eventful(self) -> bool:
         """Whether something may happen in its missions."""
-        return self.rates != Rates()
+        return self.rates != Rates() or self.unfold is not None
 
 
 @dataclass(frozen=True)
@@ -337,10 +349,40 @@ def draw_mission(recipe: Recipe, number: int, site: Ground,
             events = _draw_events(recipe.rates, mission, grid_problem(mission, passable), plan,
                                   rng, kinds)
             done = msgspec.structs.replace(mission, events=events)
+            if recipe.unfold is not None:
+                done = _unfolding(recipe, mission, passable, rng)
             return missions.check(done, done.name), draws
     share = ", ".join(f"{name} {100 * cells.mean():.0f} %" for name, cells in passable.items())
     raise InputError(recipe.source, f"allows none of {MOST_DRAWS} random missions; cells open to: "
                      f"{share}")
+
+
+def _unfolding(recipe: Recipe, mission: Mission, passable: dict[str, BoolArray],
+               rng: np.random.Generator) -> Mission:
+    """The mission by the clock, with what nobody knows of it beforehand."""
+    robots, targets, expects = mission.robots, mission.targets, Prospect()
+    events: list[Event] = []
+    if recipe.unfold == "hidden":
+        robots = tuple(msgspec.structs.replace(r, sensor_m=SENSOR_M) for r in robots)
+        events = [Event(target=target, on_sight=True) for target in targets]
+        targets = ()
+    elif recipe.unfold == "losses":
+        expects, when = Prospect(loss=LOSS), float(rng.uniform(0.0, LOSS.until))
+        who = robots[int(rng.integers(len(robots)))].name
+        if rng.random() < LOSS.share:
+            events = [Event(lost=who, at_s=round(when, 2))]
+    else:
+        snapshot = Snapshot.start(grid_problem(mission, passable))
+        come = _new_targets(MORE, snapshot, mission, rng)
+        times = np.cumsum(rng.exponential(EVERY_S, MORE)).round(2).tolist()
+        if recipe.unfold == "arrivals":
+            expects = Prospect(every=EVERY_S)
+            events = [Event(target=t, at_s=s) for t, s in zip(come, times, strict=True)]
+        else:
+            events = [Event(target=t, at_solved=k) for k, t in enumerate(come, 1)]
+    return msgspec.structs.replace(
+        mission, robots=robots, targets=targets, events=tuple(events), expects=expects,
+        clock="seconds", max_seconds=recipe.max_seconds)
 
 
 def _named(drawn: Scenario, names: Sequence[str]) -> Scenario:

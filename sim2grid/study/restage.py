@@ -72,7 +72,8 @@ def restage(report: dict[str, Any], number: int, source: object,
     width = min(int(report["options"]["width"]), int(report["options"]["count"]))
     if chosen.mode == "clock":
         prepared = prepare(by_the_clock(mission, source), source)
-        timed = execution_of(prepared, chooser(chosen), row.seed)
+        timed = execution_of(
+            prepared, chooser(chosen, prepared.mission, row.seed), row.seed)
         return Staged(chosen, _among(report, prepared), timed, None, row, width)
     prepared = _among(report, prepare(mission, source))
     make = maker(chosen)

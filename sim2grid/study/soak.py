@@ -29,7 +29,6 @@ from moonteam.planners.base import Snapshot
 from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.search.travel import UNREACHABLE, travel_times
 from moonteam.planners.seconds import registry as timed_planners
-from moonteam.planners.seconds.keeper import Keeper
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import Event, Mission, Robot, Silent, Target
 from moonteam.problem.scenario import Scenario
@@ -37,6 +36,7 @@ from moonteam.report.progress import bar
 from moonteam.robots import KINDS, OWN, team
 from moonteam.terrain.travel import Roads
 from sim2grid.clock.execution import TimedExecution
+from sim2grid.clock.prepare import choosing
 from sim2grid.loop.asked import Mode
 from sim2grid.loop.drive import Backend, run
 from sim2grid.loop.execution import Execution
@@ -149,7 +149,7 @@ class Stage:
         fleet = self.fleet
         mission, scenario = fleet.missions[index], fleet.scenarios[index]
         if who.mode == "clock":
-            chooser = Keeper(timed_planners.find(who.planner).make(who.options))
+            chooser = choosing(timed_planners.find(who.planner).make(who.options), mission)
             return TimedExecution(mission, scenario, chooser, fleet.bodies, fleet.frame,
                                   self.roads, seed=who.seed)
         return Execution(mission, scenario,

@@ -126,7 +126,7 @@ def test_a_third_of_the_missions_lose_one_robot():
     (["3x5"], "3x5: is in steps"), (["--futures", "1"], "--futures: 1 is not allowed; 2 to 4096"),
     (["--goal", "waiting"], "--goal: has no effect without --futures"),
     (["--foresee", "policies"], "--foresee: has no effect without --futures"),
-    (["--search", "sweep"], "--search: has no effect where no target is hidden"),
+    (["--search", "sweep"], "--search sweep: has no effect where no target is hidden; stay"),
     (["--planner", "best"], "no such planner by the clock"),
     (["--decode", "sample"], "--decode: has no effect without --planner policy"),
     (["unfolding/follow"], "unfolding/follow"), (["--resume"], "--resume: needs the folder")])

@@ -17,7 +17,7 @@ from moonteam.problem.timed import Timed
 FILES = ("config.json", "rows.jsonl", "report.json", "summary.csv", "rows.csv", "table.md",
          "unfolding.png")
 """In --out."""
-Search = Literal["nearest", "sweep", "places"]
+Search = Literal["nearest", "sweep", "places", "stay", "middle"]
 Goal = Literal["makespan", "waiting"]
 
 
@@ -64,8 +64,9 @@ class Args(Seeded, Limited, Resumable, Reported):
     """What is to be least over futures: makespan, or waiting, which is how long targets wait for
     their services; again for more rows. Default: makespan."""
     search: Many[tuple[Search, ...]] = ()
-    """Where targets are hidden: nearest, sweep or places; again for more rows. Default: the first
-    two."""
+    """Where targets are hidden: nearest, sweep or places; default: the first two. Where they come:
+    stay (default), or middle, where who has nothing to do goes to where the next target is soonest
+    reached in the mean. Again for more rows."""
     policy: Many[tuple[str, ...]] = ()
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy; again for
     more."""
@@ -81,13 +82,15 @@ def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
 
     Raises InputError.
     """
+    from moonteam.planners.unfolding.make import check_search
+
     found = [one for one in load_any(args.set, args.limit) if isinstance(one, Timed)]
     if not found:
         raise InputError(args.set, "is in steps; a set by the clock is needed, such as "
                          "unfolding/following")
     hidden = any(target.hidden for one in found for target in one.targets)
-    if args.search and not hidden:
-        raise InputError("--search", "has no effect where no target is hidden")
+    for search in args.search:
+        check_search(search, hidden)
     for option, given in (("--goal", args.goal), ("--foresee", args.foresee != "all")):
         if given and not args.futures:
             raise InputError(option, "has no effect without --futures")
@@ -100,10 +103,11 @@ def run(args: Args) -> int:
     """Plays, compares, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
     from moonteam.evaluation import timed, unfolding
+    from moonteam.planners.unfolding.make import PATTERNS
     from moonteam.report import command, journal
 
     found, hidden, ahead = _missions(args)
-    patterns = args.search or tuple(unfolding.PATTERNS) if hidden else ()
+    patterns = args.search or (tuple(PATTERNS) if hidden else ())
     rows = unfolding.rows_of(timed.contenders(options_of(args)), args.futures, patterns, args.goal,
                              ahead, args.foresee)
     kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)

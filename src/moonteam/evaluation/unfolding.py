@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -19,7 +19,6 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import MS, TimedPlanner, enough, moment
-from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.policy import PolicyPlanner
 from moonteam.planners.unfolding.ahead import LookingAhead
 from moonteam.planners.unfolding.deciders import (
@@ -27,14 +26,19 @@ from moonteam.planners.unfolding.deciders import (
     Choose,
     Decider,
     Goal,
-    OverFutures,
     Replanning,
     planned,
     play,
     play_together,
 )
-from moonteam.planners.unfolding.pointing import Pointing
-from moonteam.planners.unfolding.search import NearestUnseen, Pattern, Sweep
+from moonteam.planners.unfolding.make import (
+    ALL_AT_ONCE,
+    PLACES,
+    STAY,
+    decider_of,
+    pointing,
+    searching,
+)
 from moonteam.planners.unfolding.state import Outcome
 from moonteam.planners.unfolding.world import World
 from moonteam.problem.timed import Timed
@@ -44,9 +48,6 @@ from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.progress import track
 from moonteam.report.tables import Column
 
-PATTERNS: dict[str, Callable[[], Pattern]] = {"nearest": NearestUnseen, "sweep": Sweep}
-PLACES = "places"
-"""Beside the patterns: places to look from are planned for as if they were targets."""
 PANELS = (("gap", "seconds over the first row, %", 100.0),
           ("waited_gap", "waiting over the first row, %", 100.0),
           ("success", "success", 1.0))
@@ -93,20 +94,14 @@ class Row:
         return self.ahead or (self.contender.together and not self.futures)
 
     def _replanning(self) -> Replanning:
-        return Replanning(self.planner, self._searching(), self.pattern == PLACES)
-
-    def _searching(self) -> Pattern | None:
-        return PATTERNS[self.pattern]() if self.pattern in PATTERNS else None
+        return Replanning(self.planner, searching(self.pattern), self.pattern == PLACES)
 
     def decider(self, number: int, seed: int) -> Decider:
         """Who decides in mission `number`."""
         if not self.futures:
             return self._replanning()
-        pattern = self._searching()
-        choose = pointing(self.planner)
-        planner = self.planner if choose is None else ExactPlanner()
-        return OverFutures(planner, self.futures, seed * 1_000_003 + number, pattern, choose,
-                           self.goal)
+        return decider_of(self.planner, search=self.pattern, futures=self.futures, goal=self.goal,
+                          seed=seed * 1_000_003 + number, certain=self.ahead)
 
     def play(self, problem: Timed, number: int, seed: int) -> Played:
         """One mission."""
@@ -178,19 +173,12 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
         over = futures if not one.together or points else ()
         if foresee != "all" and isinstance(one.planner, PolicyPlanner) != (foresee == "policies"):
             over = ()
-        for pattern in patterns or [""]:
+        for pattern in ["" if name == STAY else name for name in patterns] or [""]:
             found += [Row(one, 0, pattern)]
-            looks = ahead and points and pattern in ("", PLACES)
+            looks = ahead and points and pattern in ALL_AT_ONCE
             found += [Row(one, count, pattern, goal, looks) for count in over
                       for goal in goals or GOALS[:1] if looks or pattern != PLACES]
     return found
-
-
-def pointing(planner: TimedPlanner) -> Choose | None:
-    """A policy's likeliest choices of many moments in one call; None of other planners."""
-    if isinstance(planner, PolicyPlanner) and planner.tries == 1 and planner.heat == 0.0:
-        return Pointing(planner.policy, planner.preference).choose
-    return None
 
 
 def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: str, command: str,

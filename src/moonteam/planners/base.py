@@ -66,9 +66,9 @@ class Snapshot:
         kinds, passable = passable_maps(scenario)
         cells = np.array([a.at for a in agents], np.int32)
         skills = np.array([scenario.mask(a.skills) for a in agents], np.int32)
-        target_cells = np.array([t.at for t in targets], np.int32)
+        target_cells = np.array([t.at for t in targets], np.int32).reshape(-1, 2)
         need = np.array([scenario.mask(t.skills) for t in targets], np.int32)
-        both = np.array([t.type == "AND" and len(set(t.skills)) > 1 for t in targets])
+        both = np.array([t.type == "AND" and len(set(t.skills)) > 1 for t in targets], bool)
         return cls(
             size=scenario.size, cells=cells, agent_skills=skills, agent_kinds=kinds,
             agent_mask=np.ones(len(agents), bool), target_cells=target_cells,

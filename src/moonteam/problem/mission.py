@@ -87,7 +87,8 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     """One robot of a kind (a registered name, or FILE.py:OBJECT), with skills and start.
 
     By the clock it may be slower than its kind (`speed`, m/s) and have a `home` to be back at.
-    With a `battery` it is lost when that is empty.
+    With a `battery` it is lost when that is empty. With eyes it sees targets that nobody knows of
+    yet within `sensor_m`.
     """
 
     name: Name
@@ -97,6 +98,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     speed: float | None = None
     home: Place | None = None
     battery: Battery | None = None
+    sensor_m: float | None = None
 
     @property
     def cell(self) -> Cell:
@@ -171,7 +173,8 @@ class Impassable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Something that happens when decision `at_decision`, counted from 1, is done; one of the
-    other keys says what. By the clock it happens at second `at_s`.
+    other keys says what. By the clock it happens at second `at_s`, and a target also when so many
+    others are solved (`at_solved`), or once a robot with a sensor is near it (`on_sight`).
     """
 
     at_decision: int = 0
@@ -181,6 +184,8 @@ class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     silent: Silent | None = None
     impassable: Impassable | None = None
     at_s: float | None = None
+    at_solved: int = 0
+    on_sight: bool = False
 
 
 class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -188,7 +193,8 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     `clock`: in steps a decision is one cell, as the paper has it, and the mission has failed after
     `max_steps` of them. In seconds a decision is a target, held until something happens, and the
-    mission has failed after `max_seconds`. `sun`: without one, light is not asked about.
+    mission has failed after `max_seconds`. `sun`: without one, light is not asked about. `expects`:
+    what everybody may expect of what nobody knows yet, its area in cells.
     """
 
     map: Map
@@ -201,6 +207,18 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     clock: Literal["steps", "seconds"] = "steps"
     max_seconds: float = 900.0
     sun: Sun | None = None
+    expects: timed.Prospect | None = None
+
+    @property
+    def unfolds(self) -> bool:
+        """Whether it says what may come, or targets come by what the team does."""
+        return self.expects is not None or any(
+            event.on_sight or event.at_solved for event in self.events)
+
+    @property
+    def searches(self) -> bool:
+        """Whether targets are hidden."""
+        return any(event.on_sight for event in self.events)
 
     def powered(self) -> list[int]:
         """Numbers of the robots that have a battery."""
@@ -298,6 +316,7 @@ def _check_clock(mission: Mission, source: object) -> None:
         timed.check_coalition(target, team, fail)
         if target.lapses is None and target.appears + target.service > mission.max_seconds:
             raise fail("service", f"would end after max_seconds, {mission.max_seconds:g}")
+    _check_expects(mission, source)
     for j in timed.after_itself(after):
         raise InputError(source, "it would come before itself: a circle of targets that wait for "
                          "each other", f"targets[{j}].after")
@@ -307,7 +326,8 @@ def _check_steps(mission: Mission, source: object) -> None:
     """Raises InputError for what means nothing where a decision is one cell."""
     later = ("coalition", "service", "after", "appears", "lapses")
     said = [(f"robots[{i}].{key}", getattr(robot, key)) for i, robot in enumerate(mission.robots)
-            for key in ("speed", "home")]
+            for key in ("speed", "home", "sensor_m")]
+    said += [("expects", mission.expects)]
     said += [(f"targets[{j}].{key}", getattr(target, key))
              for j, target in enumerate(mission.targets) for key in later]
     for key, value in said:
@@ -333,6 +353,9 @@ def _check_skills(mission: Mission, targets: tuple[Target, ...], source: object,
 
 def _as_mission_keys(mission: Mission, source: object) -> None:
     """Checks the grid problem, with keys named as they stand in the mission file."""
+    brought = tuple(event.target for event in mission.events if event.target is not None)
+    if not mission.targets and mission.clock == "seconds":  # then all of them come later
+        mission = msgspec.structs.replace(mission, targets=brought)
     try:
         scenario.check(mission.scenario(), source)
     except InputError as error:
@@ -433,13 +456,20 @@ def _check_event(mission: Mission, event: Event, source: object, key: str) -> No
 
 def _check_when(mission: Mission, event: Event, source: object, key: str) -> None:
     """Raises InputError for an event that comes at no time, or by the other clock."""
+    later = [name for name in ("at_solved", "on_sight") if getattr(event, name)]
     if mission.clock == "seconds":
-        if event.at_decision or event.at_s is None:
+        if event.at_decision or (event.at_s is not None) + len(later) != 1:
             raise InputError(source, "say when: at_s, in seconds; decisions are counted only where "
-                             "the clock is steps", key)
-        if not 0 <= event.at_s <= timed.MOST_SECONDS:
+                             "the clock is steps; a target may also come at_solved or on_sight",
+                             key)
+        if event.at_s is not None and not 0 <= event.at_s <= timed.MOST_SECONDS:
             raise InputError(source, f"{event.at_s:g} is not allowed; 0 to {timed.MOST_SECONDS:g}",
                              f"{key}.at_s")
+        for name in later:
+            _check_later(mission, event, source, f"{key}.{name}")
+    elif later:
+        raise InputError(source, "is for missions by the clock; say clock: seconds too, or "
+                         "at_decision", f"{key}.{later[0]}")
     elif event.at_s is not None:
         raise InputError(source, "is for missions by the clock; say clock: seconds too, or "
                          "at_decision", f"{key}.at_s")
@@ -447,6 +477,30 @@ def _check_when(mission: Mission, event: Event, source: object, key: str) -> Non
         raise InputError(source, f"{event.at_decision} is not allowed; decisions are counted from "
                          f"1, and an event comes when one is done: 1 to {MOST_STEPS}",
                          f"{key}.at_decision")
+
+
+def _check_later(mission: Mission, event: Event, source: object, key: str) -> None:
+    """Raises InputError for a target that is found by nobody, or follows on too many others."""
+    if event.target is None:
+        raise InputError(source, "is for targets; for what else happens say at_s", key)
+    if event.on_sight and all(robot.sensor_m is None for robot in mission.robots):
+        raise InputError(source, "no robot can see it: give one a sensor_m, in metres", key)
+    brought = [e for e in mission.events if e.target is not None]
+    before = len(mission.targets) + sum(
+        e is not event and e.at_solved < max(event.at_solved, 1) for e in brought)
+    if event.at_solved and not 1 <= event.at_solved <= before:
+        raise InputError(source, f"{event.at_solved} is not allowed; at most so many can be solved "
+                         f"before it: {before}", key)
+
+
+def _check_expects(mission: Mission, source: object) -> None:
+    """What may come, and who could see it. Raises InputError."""
+    for i, robot in enumerate(mission.robots):
+        if robot.sensor_m is not None and not 0 < robot.sensor_m <= timed.MOST_SIDE:
+            raise InputError(source, f"{robot.sensor_m:g} is not allowed; metres, above 0, at most "
+                             f"{timed.MOST_SIDE}", f"robots[{i}].sensor_m")
+    if mission.expects is not None:
+        timed.check_expects(mission.expects, lambda key, p: InputError(source, p, key))
 
 
 def _check_robot(mission: Mission, name: str, source: object, key: str) -> None:

@@ -387,7 +387,8 @@ def _check_unfolding(timed: Timed, fail: Any) -> None:
         for value in agent.pace:
             if not 0.01 <= value <= 100:
                 raise say("pace", f"{value:g} is not allowed; 0.01 to 100")
-    _check_expects(timed, fail)
+    if timed.expects is not None:
+        check_expects(timed.expects, fail)
     known = [not t.hidden and not t.following for t in timed.targets]
     for j, target in enumerate(timed.targets):
         say = lambda key, problem, j=j: fail(f"targets[{j}].{key}", problem)
@@ -405,11 +406,8 @@ def _check_unfolding(timed: Timed, fail: Any) -> None:
                        "solved before it")
 
 
-def _check_expects(timed: Timed, fail: Any) -> None:
-    """Raises for expectations that cannot be."""
-    expects = timed.expects
-    if expects is None:
-        return
+def check_expects(expects: Prospect, fail: Any) -> None:
+    """Raises `fail(key, problem)` for expectations that cannot be."""
     if not 0 <= expects.more <= MOST_TARGETS:
         raise fail("expects.more", f"{expects.more} is not allowed; 0 to {MOST_TARGETS}")
     if expects.every is not None and not 0 < expects.every <= MOST_SECONDS:

@@ -11,7 +11,7 @@ from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.unfolding.deciders import Decider, OverFutures, Replanning
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.search import NearestUnseen, Sweep
+from moonteam.planners.unfolding.search import Middle, NearestUnseen, Sweep
 from moonteam.planners.unfolding.world import World
 from moonteam.problem import timed
 from moonteam.problem.timed import Agent, Loss, Prospect, Target, Timed
@@ -252,3 +252,20 @@ def test_who_waits_until_another_is_there_is_asked_again_then():
     world.step([0, -1])
     assert world.over
     assert world.outcome.reason == "nothing can happen any more"
+
+
+def test_who_has_nothing_to_do_goes_to_where_the_next_target_is_soonest_reached():
+    """Of two of the same skill the second goes elsewhere, of other skills to the middle too."""
+    area = (0.0, 0.0, 40.0, 40.0)
+    problem = mission(
+        [Agent((0.0, 0.0), ("A",), 2.0), Agent((1.0, 0.0), ("A",)), Agent((2.0, 0.0), ("B",))],
+        [Target((0.0, 1.0), ("A",)), Target((38.0, 20.0), ("B",), appears=60.0)],
+        expects=Prospect(more=1, every=30.0, area=area))
+    view = World(problem).view()
+    found = Middle().look(view, [0, 1, 2])
+    assert np.hypot(*(np.array(found[0]) - 20.0)) < 5.0
+    assert np.hypot(*(np.array(found[2]) - 20.0)) < 5.0
+    assert found[1] != found[0]
+    stays, _ = played(problem, Replanning(ExactPlanner()))
+    goes, _ = played(problem, Replanning(ExactPlanner(), Middle()))
+    assert goes.outcome.seconds < stays.outcome.seconds - 10.0

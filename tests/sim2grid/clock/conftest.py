@@ -46,13 +46,13 @@ def make_mission(robots, targets, size=(12, 12), **more):
 
 
 def run_by_the_clock(points, spec, *order, spare=None, faults=None, roads=None, traps=(),
-                     light=None, **options):
+                     light=None, chooser=None, **options):
     frame = Frame(spec.map.size, spec.map.cell_m)
     backend = points(frame.centre(np.array([r.start for r in spec.robots], float)),
                             faults or {}, list(traps))
     bodies = [Body(base=7 * i, speed=SPEEDS[r.kind], flies=r.kind == "drone", light=light)
               for i, r in enumerate(spec.robots)]
-    keeper = Keeper(Fixed(*order, spare=spare))
+    keeper = chooser or Keeper(Fixed(*order, spare=spare))
     execution = TimedExecution(spec, spec.scenario(), keeper, bodies, frame,
                                roads or OpenGround(SPEEDS), **options)
     run([execution], backend, backend.pose())

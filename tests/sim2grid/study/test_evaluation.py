@@ -246,6 +246,13 @@ CLOCKED = "tests/evaluation/nearest.py"
     (["--mission", "demo", "--team", "drone"], "--team: is for random missions"),
     (["--mission", "outpots"], "outpots: no such file; did you mean outpost"),
     (["--mission", "demo", "sampling"], "sampling: clock: is by the clock, which --mode clock"),
+    (["--unfold", "hidden"], "--unfold: its missions are by the clock; --mode clock"),
+    (["--unfold", "hidden", "--mode", "clock", "--lose", "1"], "--lose: comes at decisions"),
+    (["--unfold", "hidden", "--mode", "clock", "--search", "middle", "--count", "1"],
+     "--search middle: has no effect where targets are hidden"),
+    (["--mode", "clock", "--futures", "1"], "--futures: 1 is not allowed; 2 to 4096"),
+    (["--mode", "clock", "--search", "sweep", "--count", "1", "--side", "6", "--targets", "1"],
+     "--search: has no effect in mare-0-0"),
     (["--dem", "none.tif"], "none.tif: no such file"),
     (["--dem", "examples/ground/rim.tif", "--centre", "30", "0"],
      "rim.tif: is too small: 32 by 32 m of ground are needed around 30 m east, 0 m north"),
@@ -465,3 +472,23 @@ def test_the_fused_backend_stands_in_the_table_or_says_what_it_takes(capsys):
     for refused in (["--planner", "exact"], ["--lose", "1"], ["--decode", "best-of-4"]):
         assert main([*words, "--backend", "fused", *refused]) == 2
         assert "--backend fused" in capsys.readouterr().err
+
+
+def test_missions_that_unfold_are_driven_and_end_the_same_alone(tmp_path):
+    out = tmp_path / "out"
+    code, text, err = command("--mode", "clock", "--unfold", "hidden", "--count", "2", "--search",
+                              "nearest", "places", "--out", str(out), "--json")
+    assert code == 0, err
+    report = json.loads(text)
+    assert [c["name"] for c in report["contenders"]] == [
+        "closed exact nearest clock", "closed exact places clock"]
+    for row in report["rows"]:
+        assert row["report"]["success"], row["report"]
+        assert row["report"]["replans"]["found"] >= 1
+    code = main(["rollout", "--from", str(out / "report.json"), "--mission", "1", "--no-video",
+                 "--contender", "closed exact places clock", "--out", str(tmp_path / "again")])
+    assert code == 0
+    again = json.loads((tmp_path / "again" / "report.json").read_text())
+    [first] = [row["report"] for row in report["rows"]
+               if row["number"] == 1 and "places" in row["contender"]]
+    assert again["seconds"] == first["seconds"]

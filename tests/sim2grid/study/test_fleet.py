@@ -1,5 +1,6 @@
 """Random missions on a site: drawn from seeds, legal on their ground, with events at random."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -208,3 +209,34 @@ def test_missions_go_round_sites_as_each_site_alone_has_them():
         assert tuple(mixed.scenarios[k] for k in rows) == alone.scenarios
         np.testing.assert_array_equal(mixed.starts[rows], alone.starts)
         assert all((mixed.site_of(k).heights == alone.site.heights).all() for k in rows)
+
+
+@pytest.mark.parametrize("unfold", ["following", "arrivals", "hidden", "losses"])
+def test_missions_that_unfold_say_what_will_happen_and_what_may_be_expected(unfold):
+    recipe = replace(RECIPE, unfold=unfold)
+    first, second = (make_fleet(recipe, 4).missions for _ in range(2))
+    assert first == second
+    assert first != make_fleet(replace(recipe, seed=8), 4).missions
+    for mission in first:
+        assert mission.clock == "seconds"
+        assert mission.unfolds
+        assert mission.expects is not None
+        come = [event for event in mission.events if event.target is not None]
+        if unfold == "hidden":
+            assert mission.targets == ()
+            assert len(come) == 3
+            assert all(event.on_sight for event in come)
+            assert all(robot.sensor_m == 6.0 for robot in mission.robots)
+        elif unfold == "losses":
+            assert not come
+            assert len(mission.events) <= 1
+        else:
+            assert len(mission.targets) == 3
+            assert len(come) == 5
+            assert len({event.target.at for event in come} | {t.at for t in mission.targets}) == 8
+        if unfold == "following":
+            assert [event.at_solved for event in come] == [1, 2, 3, 4, 5]
+        if unfold == "arrivals":
+            times = [event.at_s for event in come]
+            assert times == sorted(times)
+            assert mission.expects.every == 10.0

@@ -45,15 +45,15 @@ class Decider(Protocol):
 class Replanning:
     """Plans what is known of anew at every event, and looks no further.
 
-    A plan is kept until another is better. Robots that it has nothing for go home, or look for
-    hidden targets by the pattern; or, with `places`, places to look from are planned for as if
-    they were targets.
+    A plan is kept until another is better, by `margin_ms`. Robots that it has nothing for go home,
+    or look for hidden targets by the pattern; or, with `places`, places to look from are planned
+    for as if they were targets.
     """
 
     def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None,
-                 places: bool = False):
+                 places: bool = False, margin_ms: int = 0):
         self._planner, self._pattern, self._places = planner, pattern, places
-        self._keeper = Keeper(planner, margin_ms=0)
+        self._keeper = Keeper(planner, margin_ms)
 
     def act(self, view: View) -> list[Order]:
         """See `Decider`."""
@@ -76,11 +76,13 @@ class Replanning:
             if view.looks and isinstance(choice, int) and choice >= len(view.targets):
                 look, reach = view.looks[choice - len(view.targets)], view.agents[i].sensor or 0.0
                 orders[i] = look.from_afar(view.places[i], INSIDE * reach)
-        if self._pattern is None or not view.coming or view.ground is None:
+        pattern = self._pattern
+        if pattern is None or not view.coming or (pattern.eyes and view.ground is None):
             return orders
         idle = [i for i in np.flatnonzero(view.moment.present & (chosen < 0)).tolist()
-                if view.moment.free[i] == 0 and view.agents[i].sensor is not None]
-        for i, place in self._pattern.look(view, idle).items():
+                if view.moment.free[i] == 0
+                and not (pattern.eyes and view.agents[i].sensor is None)]
+        for i, place in pattern.look(view, idle).items():
             orders[i] = place
         return orders
 

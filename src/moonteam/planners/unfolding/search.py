@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from moonteam.grid.macro.draw import places
 from moonteam.planners.seconds.base import NEVER
 from moonteam.planners.unfolding.ground import INSIDE
 from moonteam.planners.unfolding.state import distances, ms
@@ -19,11 +20,43 @@ from moonteam.problem.timed import Place
 
 
 class Pattern(Protocol):
-    """Says where to look next."""
+    """Says where robots go that have nothing else to do, while targets are still to come."""
+
+    eyes: bool
+    """Whether it is for robots that see, where something is hidden; else for all."""
 
     def look(self, view: View, idle: Sequence[int]) -> dict[int, Place]:
         """A place for each robot that has nothing else to do."""
         ...
+
+
+class Middle:
+    """Everybody to where the next target is soonest reached in the mean.
+
+    Robots of the same skills share the area: each goes where the mean, over places, of the time of
+    whoever of them is there first falls most.
+    """
+
+    eyes = False
+
+    def look(self, view: View, idle: Sequence[int]) -> dict[int, Place]:
+        """See `Pattern`."""
+        area = view.expects.area
+        if area is None:
+            return {}
+        spread = places(np.array(area[:2]), np.array(area[2:]))
+        far = distances(spread, spread, view.state.problem.metric)
+        found: dict[int, Place] = {}
+        first: dict[tuple[str, ...], np.ndarray] = {}
+        for i in sorted(idle, key=lambda i: -view.agents[i].speed):
+            skills, took = view.agents[i].skills, far / view.agents[i].speed
+            others = first.get(skills, np.full(len(spread), np.inf))
+            means = np.minimum(took, others).mean(1)
+            best = int(means.argmin())
+            first[skills] = np.minimum(took[best], others)
+            x, y = spread[best]
+            found[i] = float(x), float(y)
+        return found
 
 
 class NearestUnseen:
@@ -31,6 +64,8 @@ class NearestUnseen:
 
     Who is soonest chooses first; what it will see from there is left out for the others.
     """
+
+    eyes = True
 
     def look(self, view: View, idle: Sequence[int]) -> dict[int, Place]:
         """See `Pattern`."""
@@ -58,7 +93,10 @@ class Sweep:
     fast; each goes up and down its own in lanes as wide as it sees, then looks where it is nearest.
     """
 
-    def __init__(self) -> None:
+    eyes = True
+
+    def __init__(self, near: float = 1e-6) -> None:
+        self._near = near  # m, at which the end of a lane has been reached
         self._lanes: dict[int, list[Place]] = {}
         self._rest = NearestUnseen()
         self._cut = False
@@ -72,7 +110,7 @@ class Sweep:
         found, free = {}, []
         for i in idle:
             lanes = self._lanes.get(i, [])
-            while lanes and np.hypot(*(view.places[i] - lanes[0])) < 1e-6:
+            while lanes and np.hypot(*(view.places[i] - lanes[0])) <= self._near:
                 lanes.pop(0)
             if lanes:
                 found[i] = lanes[0]
