@@ -587,7 +587,7 @@ def _film(made: Run, best: Optimum | None) -> Film:
     return Film(Take(
         prepared.mission, made.execution.record, prepared.frame,
         Ground.of(site), made.title, actors_of(prepared), prepared.barred(),
-        ways, optimum.lines(best),
+        ways, () if prepared.mission.unfolds else optimum.lines(best),
         f"{site.name} ground, seed {site.seed}" + words.sunlight(site.sun)))
 
 

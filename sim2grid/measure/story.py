@@ -20,6 +20,9 @@ WORDS = {
     "timeout": "late", "wrong_cell": "in another cell than planned", "robot_lost": "lost"}
 """Of the causes of new plans; the others are their own words."""
 
+NEWS = ("new_target", "found")
+"""Causes that are a target of which nobody knew."""
+
 
 @dataclass(frozen=True)
 class Replan:
@@ -75,7 +78,7 @@ class Story:
 
     def targets_at(self, decision: int) -> int:
         """How many targets were known once `decision` joint actions had been taken."""
-        late = sum(1 for d, cause in self.record.replans if cause == "new_target" and d >= decision)
+        late = sum(1 for d, cause in self.record.replans if cause in NEWS and d >= decision)
         return len(self.record.targets) - late
 
     def _replans(self) -> list[Replan]:
@@ -85,11 +88,12 @@ class Story:
         new = len(self.mission.targets)
         for decision, cause in dict.fromkeys(self.record.replans):
             time_s = asked.get(decision, self.record.seconds())
-            if cause == "new_target":
+            if cause in NEWS:
                 for _ in range(self.record.replans.count((decision, cause))):
-                    found.append(Replan(time_s, decision, cause, None, self._centre(
-                        self.record.targets[new].at),
-                        f"new target {self.record.target_names[new]}"))
+                    name = self.record.target_names[new]
+                    found.append(Replan(
+                        time_s, decision, cause, None, self._centre(self.record.targets[new].at),
+                        f"new target {name}" if cause == "new_target" else f"{name} is found"))
                     new += 1
             elif cause == "impassable":
                 found += [Replan(time_s, decision, cause, None, self._centre(at),

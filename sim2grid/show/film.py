@@ -173,9 +173,12 @@ class Film:
         """Text, size and colour of each line of the first card."""
         mission = self.mission
         wide, high = (n * mission.map.cell_m for n in mission.map.size)
+        hidden = sum(event.on_sight for event in mission.events)
+        about = [_many(len(mission.robots), "robot")]
+        about += [_many(len(mission.targets), "target")] if mission.targets or not hidden else []
+        about += [_many(hidden, "hidden target")] if hidden else []
         lines = [(self.take.title, 46.0, INK),
-                 (f"{_many(len(mission.robots), 'robot')}, {_many(len(mission.targets), 'target')}"
-                  f", {wide:g} x {high:g} m", 24.0, DIM)]
+                 (f"{', '.join(about)}, {wide:g} x {high:g} m", 24.0, DIM)]
         if self.take.about:
             lines.append((self.take.about, 20.0, DIM))
         for i, robot in enumerate(mission.robots[:6]):
@@ -247,7 +250,8 @@ class Film:
         for i, spec in enumerate(self.mission.robots):
             path = self.paths[i][:moment.index + 1]
             thinned = np.concatenate([path[::step], path[-1:]])
-            robots.append(RobotMark(spec.name, self.take.actors[i].glyph, thinned, i in lost))
+            eyes = spec.sensor_m if self.mission.searches else None
+            robots.append(RobotMark(spec.name, self.take.actors[i].glyph, thinned, i in lost, eyes))
         targets = [TargetMark(self.record.target_names[j], target, j in moment.solved)
                    for j, target in enumerate(self.record.targets[:moment.targets])]
         return robots, targets, [r.xy for r in moment.replans if r.xy is not None]

@@ -32,6 +32,8 @@ Color = tuple[int, int, int]
 
 INK: Color = (235, 238, 245)
 NIGHT: Color = (14, 17, 26)
+UNSEEN = 150
+"""How dark what nobody has seen yet is on the map, of 255."""
 OPEN: Color = (255, 86, 60)
 SOLVED: Color = (70, 215, 110)
 BARRED: Color = (150, 60, 60)
@@ -116,6 +118,8 @@ class RobotMark:
     glyph: Glyph
     path: npt.NDArray
     lost: bool = False
+    sensor_m: float | None = None
+    """m about its path that it has seen, where something is hidden."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,8 @@ class MapPicture:
         [n, 2] m, dashed.
         """
         image = self._base.copy()
+        if any(robot.sensor_m for robot in robots):
+            self._shade_unseen(image, robots)
         pen = ImageDraw.Draw(image)
         for mark in targets:
             self._target(pen, mark, labels)
@@ -173,6 +179,21 @@ class MapPicture:
         """Pixels [..., 2] of points [..., 2] m."""
         at = self.frame.continuous(np.nan_to_num(xy)) * self.pixel
         return np.stack([at[..., 0], self.height - at[..., 1]], axis=-1)
+
+    def _shade_unseen(self, image: Image.Image, robots: Sequence[RobotMark]) -> None:
+        """Darkens what no robot with a sensor has come near."""
+        unseen = Image.new("L", image.size, UNSEEN)
+        pen = ImageDraw.Draw(unseen)
+        for robot in robots:
+            if robot.sensor_m is None:
+                continue
+            reach = robot.sensor_m / self.frame.cell_m * self.pixel
+            points = self._pixels(robot.path)
+            if len(points) > 1:
+                pen.line([tuple(p) for p in points], fill=0, width=round(2 * reach), joint="curve")
+            for x, y in points[[0, -1]]:
+                pen.ellipse([x - reach, y - reach, x + reach, y + reach], fill=0)
+        image.paste(NIGHT, (0, 0, *image.size), unseen)
 
     def _draw_base(self, ground: Ground, barred: npt.NDArray[np.bool_] | None) -> Image.Image:
         shade = hillshade(ground)

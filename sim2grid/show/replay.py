@@ -36,7 +36,7 @@ from sim2grid.clock.unfold import LOOK
 from sim2grid.loop.prepare import Prepared
 from sim2grid.loop.record import SETTING_OUT, Leg
 from sim2grid.measure.slip import ground_height, slip
-from sim2grid.measure.story import Story
+from sim2grid.measure.story import NEWS, Story
 from sim2grid.show.picture import OPEN, REPLAN, SOLVED, STATES, requirement, robot_color
 from sim2grid.show.plots import hexed
 
@@ -313,7 +313,7 @@ def _targets(story: Story) -> list[dict[str, Any]]:
     """Where each is, what it needs, and from when to when it is what."""
     record, own = story.record, len(story.mission.targets)
     solves = {s.target: s for s in record.solves}
-    told = [r.time_s for r in story.replans if r.cause == "new_target"]
+    told = [r.time_s for r in story.replans if r.cause in NEWS]
     found = []
     for j, target in enumerate(record.targets):
         solve, late = solves.get(j), j - own

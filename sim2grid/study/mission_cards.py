@@ -206,8 +206,8 @@ def mission_map(mission: Mission, report: dict[str, Any], ground: str) -> str:
 
 def _late_names(mission: Mission, results: Sequence[Row], events: Sequence[Target]) -> list[str]:
     """Names of the targets that events bring: as the report has them, else as they will be."""
-    told = [t["name"] for t in results[len(mission.targets):]]
-    return [*told, *(t.name or "new" for t in events[len(told):])][:len(events)]
+    told = {tuple(t["at"]): t["name"] for t in results[len(mission.targets):]}
+    return [told.get(tuple(t.at), t.name or "new") for t in events]
 
 
 def _served(results: Sequence[Row], robot: str) -> list[Row]:

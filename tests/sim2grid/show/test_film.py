@@ -147,6 +147,17 @@ def test_the_map_puts_north_up_and_colours_targets_by_state(mission):
     assert 0.3 < blue.mean() < 0.8, "where it means to go is dashed"
 
 
+def test_the_map_is_dark_where_nobody_has_looked():
+    picture = MapPicture(Frame((10, 10), 1.0), Ground(np.zeros((41, 41)), 0.25), 400)
+    way = np.array([[-4.0, 0.0], [0.0, 0.0]])
+    plain, looked = (np.asarray(picture.draw([RobotMark("a", "triangle", way, False, eyes)], (),
+                                             labels=False)).astype(int) for eyes in (None, 2.0))
+    x, y = np.meshgrid(np.arange(400) / 40 - 5.0, 5.0 - np.arange(400) / 40)
+    gap = np.hypot(np.maximum(np.maximum(-4.0 - x, x), 0.0), y)
+    assert (looked[gap < 1.9] == plain[gap < 1.9]).all()
+    assert (looked[gap > 2.1].mean() < 0.7 * plain[gap > 2.1].mean())
+
+
 def test_skills_with_names_stand_apart(mission):
     import msgspec
 
