@@ -48,7 +48,7 @@ def choosing(planner: TimedPlanner, mission: Mission, search: Search | None = No
     if futures and search == PLACES and not pointing(planner):
         raise InputError("--search places", "over futures is for policies; give another pattern")
     expects = mission.expects
-    certain = expects is None or (expects.loss is None and not expects.scatter)
+    certain = expects is None or not expects.scatter
     return Scouting(planner.name, decider_of(
         planner, search=search or "", futures=futures, seed=seed, certain=certain,
         margin_ms=MARGIN_MS, near_m=NEAR_M))

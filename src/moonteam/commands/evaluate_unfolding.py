@@ -78,7 +78,7 @@ class Args(Seeded, Limited, Resumable, Reported):
 
 
 def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
-    """Those of the set, whether targets are hidden, and whether nothing but targets comes.
+    """Those of the set, whether targets are hidden, and whether ways take what is expected.
 
     Raises InputError.
     """
@@ -94,8 +94,7 @@ def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
     for option, given in (("--goal", args.goal), ("--foresee", args.foresee != "all")):
         if given and not args.futures:
             raise InputError(option, "has no effect without --futures")
-    others = any(one.expects is not None and (one.expects.loss is not None or one.expects.scatter)
-                 for one in found)
+    others = any(one.expects is not None and one.expects.scatter for one in found)
     return found, hidden, not others
 
 

@@ -42,9 +42,9 @@ _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": 
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
          "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "",
          "middle": "M", "middle_now": "N",
-         "lapses": "M", "free": "N", "effort": "N", "limit": "",
+         "lapses": "M", "free": "N", "lost": "N", "effort": "N", "limit": "",
          "agent_mask": "N", "target_mask": "M", "unit": ""}
-_PADDING = {"start": FAR, "between": FAR, "lapses": FAR}  # zero and False elsewhere
+_PADDING = {"start": FAR, "between": FAR, "lapses": FAR, "lost": FAR}  # zero and False elsewhere
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,8 @@ def team(has, need, start, between, **changes):
         following=np.zeros(m, np.int32), sight=np.zeros((m, m), bool), looks=zero > 0,
         coming=np.int32(0), middle=zero,
         middle_now=np.zeros(n, np.float32),
-        lapses=zero + FAR, free=np.zeros(n, np.float32), effort=np.ones(n, np.float32),
+        lapses=zero + FAR, free=np.zeros(n, np.float32),
+        lost=np.full(n, FAR, np.float32), effort=np.ones(n, np.float32),
         limit=np.float32(FAR), agent_mask=np.ones(n, bool), target_mask=np.ones(m, bool),
         unit=np.float32(1.0)), **changes)
 

@@ -44,6 +44,7 @@ class MacroProblem:
     middle_now: Array  # [N] the same from where each agent starts
     lapses: Array  # [M] s after which j does not start; FAR where it does not lapse
     free: Array  # [N] s at which each agent can first set out
+    lost: Array  # [N] s at which each agent is lost, which nobody knows before; FAR: never
     effort: Array  # [N] what a second of travel costs each agent
     limit: Array  # [] s in which everything must be done
     agent_mask: Array  # [N] bool
@@ -64,7 +65,8 @@ def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: 
         following=xp.zeros(targets, xp.int32), sight=xp.zeros((targets, targets), bool),
         looks=xp.zeros(targets, bool), coming=xp.zeros((), xp.int32), middle=none,
         middle_now=nobody,
-        lapses=none + xp.float32(FAR), free=nobody, effort=nobody + 1, limit=limit,
+        lapses=none + xp.float32(FAR), free=nobody, lost=nobody + xp.float32(FAR),
+        effort=nobody + 1, limit=limit,
         agent_mask=agent_mask, target_mask=target_mask, unit=unit)
 
 

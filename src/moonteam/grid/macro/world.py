@@ -324,7 +324,10 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     opens = jnp.where(waiting & (opens > 0), opens, FAR)
     news = problem.shown - state.now
     news = jnp.where((news > SOON) & ~state.solved, news, FAR)
-    wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)), jnp.min(news))
+    losses = jnp.where(problem.agent_mask & (problem.lost < FAR / 2),
+                       jnp.maximum(problem.lost - state.now, 0.0), FAR)
+    wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)),
+                       jnp.minimum(jnp.min(news), jnp.min(losses)))
     late = ~state.solved & ~state.serving & (state.now > problem.lapses + SOON)
     dead = (wait >= FAR / 2) | jnp.any(late)
     left = jnp.maximum(problem.limit - state.now, 0.0)
@@ -339,7 +342,22 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     ended = jnp.any(jax.nn.one_hot(jnp.where(finished, state.goal, targets), targets,
                                    dtype=bool), axis=0)
     released = (state.busy > 0) & (busy <= 0) & ~bound  # of those that could not yet set out
-    return replace(
+    after = replace(
         state, now=now, busy=busy, serving=state.serving & ~ended, solved=state.solved | ended,
         goal=jnp.where(finished, targets, state.goal),
-        since=jnp.where(finished | released, now, state.since)), dead
+        since=jnp.where(finished | released, now, state.since))
+    return _without_lost(after), dead
+
+
+def _without_lost(state: MacroState) -> MacroState:
+    """Agents whose time has come leave the team, and their services are broken off."""
+    problem = state.problem
+    targets = problem.start.shape[1]
+    gone = problem.agent_mask & (problem.lost <= state.now + SOON)
+    serves = jax.nn.one_hot(state.goal, targets, dtype=bool) & state.serving[None]  # [N, M]
+    broken = jnp.any(serves & gone[:, None], axis=0)  # [M]
+    stays = jnp.any(serves & broken[None], axis=1)  # who waits there again
+    return replace(
+        state, problem=replace(problem, agent_mask=problem.agent_mask & ~gone),
+        serving=state.serving & ~broken, goal=jnp.where(gone, targets, state.goal),
+        busy=jnp.where(gone | stays, 0.0, state.busy))

@@ -1,7 +1,7 @@
 """A policy that looks ahead: it plays what it would do, and what else it could, in many futures.
 
-Where targets follow on others or arrive by a clock, what is to come can be drawn, and the policy
-can go on in each of these futures by its likeliest choices to the end, thousands of them in one
+Where targets follow on others, arrive by a clock or are hidden, or a robot may be lost, what is to
+come can be drawn, and the policy can go on in each of these futures by its likeliest choices to the end, thousands of them in one
 call of the macro world. That is one step of policy iteration, at the moment itself.
 
 Legend: B missions, K tries of a mission, F futures, R rollouts of a call, N robots, T targets, the
@@ -29,7 +29,7 @@ from moonteam.planners import macro
 from moonteam.planners.seconds.base import MS
 from moonteam.planners.seconds.keeper import WAIT
 from moonteam.planners.unfolding.deciders import NOT_DONE, Goal
-from moonteam.planners.unfolding.future import Future, future
+from moonteam.planners.unfolding.future import Future, future, may_lose
 from moonteam.planners.unfolding.pointing import begun, moments, problem_in, said
 from moonteam.planners.unfolding.state import distances
 from moonteam.planners.unfolding.world import View
@@ -73,7 +73,7 @@ class LookingAhead:
 
     Args:
       policy: of kind pointer.
-      futures: F, the most that are drawn at a moment; one where no more targets come.
+      futures: F, the most that are drawn at a moment; one where nothing is to come.
       goal: what counts in a future: its makespan, or how long targets wait for their services.
       seed: of the draws.
       preference: 0 time .. 1 effort, of the policy.
@@ -158,7 +158,8 @@ class LookingAhead:
             coming = asked[b].view.coming
             size = max(FEWEST, macro.padded(len(asked[b].open_) + coming))
             team = asked[b].view.moment.has.shape
-            alike.setdefault((size, count if coming else 1, *team), []).append(b)
+            some = count if coming or may_lose(asked[b].view) else 1
+            alike.setdefault((size, some, *team), []).append(b)
         found = {}
         for (size, some, *_), missions in alike.items():
             problems, rows, firsts, bounds = [], [], [], []
@@ -281,6 +282,8 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
         "target_mask": np.broadcast_to(there, (count, size)),
         "unit": np.array([macro.unit_of(a, has, b) for a, b in zip(start, need, strict=True)],
                          np.float32)}
+    gone = [[FAR if t is None else t - now for t in one.lost] for one in futures]
+    columns["lost"] = np.array(gone, np.float32)
     for name in ("home_now", "has", "free", "effort", "limit", "agent_mask", "middle_now",
                  "coming"):
         value = np.asarray(getattr(known, name))

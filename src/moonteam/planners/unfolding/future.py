@@ -85,11 +85,17 @@ def _box(view: View) -> tuple[float, float, float, float]:
     return float(west), float(south), float(east), float(north)
 
 
+def may_lose(view: View) -> bool:
+    """Whether a robot may still be lost."""
+    loss = view.expects.loss
+    return loss is not None and bool(view.moment.present.all()) and view.now / MS < loss.until
+
+
 def _lost(view: View, rng: Rng) -> tuple[float | None, ...]:
     loss = view.expects.loss
     none: list[float | None] = [None] * len(view.agents)
     now = view.now / MS
-    if loss is not None and view.moment.present.all() and now < loss.until:
+    if loss is not None and may_lose(view):
         later = loss.share * (1 - now / loss.until)
         if rng.random() < later / (1 - loss.share + later):
             none[int(rng.integers(len(none)))] = float(rng.uniform(now, loss.until))

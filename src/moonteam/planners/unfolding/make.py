@@ -82,7 +82,7 @@ def decider_of(planner: TimedPlanner, *, search: str = "", futures: int = 0,
       futures: over how many; 0: it looks no further than what is known.
       goal: what is to be least over futures.
       seed: of the futures.
-      certain: nothing but targets comes, so that a policy can look ahead in the macro world.
+      certain: ways take what is expected, so that a policy can look ahead in the macro world.
       margin_ms: ms that a new plan has to gain over the one that is kept.
       near_m: m at which a robot is where it was to look from.
     """
