@@ -158,9 +158,10 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             foresee: str = "all") -> list[Row]:
     """Every planner alone, then over so many futures, by every pattern of search.
 
-    `ahead`: nothing but targets comes, so that policies can look ahead in the macro world; where
-    targets are hidden, in which there are places to look from. `foresee` says whose rows are
-    repeated over futures: all, those of policies, or of other planners.
+    `ahead`: ways take what is expected, so that policies can look ahead in the macro world; where
+    targets are hidden, by places to look from, and where these are asked for by them alone.
+    `foresee` says whose rows are repeated over futures: all, those of policies, or of other
+    planners.
 
     Raises InputError for a number of futures that is none.
     """
@@ -176,8 +177,10 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
         for pattern in ["" if name == STAY else name for name in patterns] or [""]:
             found += [Row(one, 0, pattern)]
             looks = ahead and points and pattern in ALL_AT_ONCE
+            # By a pattern every mission is imagined by itself, which takes many times as long.
+            slow = pattern == PLACES or (ahead and points and PLACES in patterns)
             found += [Row(one, count, pattern, goal, looks) for count in over
-                      for goal in goals or GOALS[:1] if looks or pattern != PLACES]
+                      for goal in goals or GOALS[:1] if looks or not slow]
     return found
 
 
