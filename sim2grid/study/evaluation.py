@@ -109,7 +109,15 @@ class Contender(msgspec.Struct, frozen=True):
 
     @property
     def who(self) -> str:
-        """Planner, or policy with its decoding where that is not argmax, and its preference."""
+        """Planner, or policy with its decoding where that is not argmax, and its preference; over
+        how many futures, and how it searches.
+        """
+        return " ".join([
+            self._decider, *([f"over {self.futures} futures"] if self.futures else []),
+            *([self.search] if self.search else [])])
+
+    @property
+    def _decider(self) -> str:
         if self.planner != "policy":
             return registry.shown(self.planner)
         words = [self.decode] if self.decode != "argmax" else []
@@ -124,8 +132,6 @@ class Contender(msgspec.Struct, frozen=True):
         The engine is named where it is not the native one.
         """
         words = [self.loop] + ([self.who] if self.loop != "oracle" else [])
-        words += [f"over {self.futures} futures"] if self.futures else []
-        words += [self.search] if self.search else []
         words += [self.mode] if self.loop in ("closed", "oracle") else []
         return " ".join(words + ([self.backend] if self.backend != "native" else []))
 

@@ -6,7 +6,8 @@ The document is `report.json` of `moonteam evaluate execution`:
 - `options`: everything that the missions and their executions depend on.
 - `contenders`: `name` with loop, mode, planner, policy, decode, objective.
 - `summary`: a row for each site and contender, figures with `intervals` of 95 %.
-- `comparisons`: async over barrier and one engine over the other, on missions that both solved.
+- `comparisons`: async over barrier, one engine over the other, and by the clock each contender over
+  the first, on missions that both solved.
 - `differences`: missions that went otherwise on another engine, and what differed.
 - `failures`: for each site and contender, cause -> mission numbers.
 - `missions`: number, draws and the whole mission as in its file.
@@ -30,6 +31,9 @@ from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import Report, RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
 from sim2grid.study.fleet import GIVEN
+
+ALL = "all"
+"""What stands for all sites together."""
 
 
 def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence[Contender],
@@ -166,10 +170,17 @@ def failures(rows: Sequence[Row]) -> dict[str, list[int]]:
 
 def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Contender],
             seed: int) -> list[dict[str, Any]]:
-    """Async over barrier, and another engine over the native one: seconds, their difference
-    mission by mission, and moves on the missions that both solved.
+    """Async over barrier, another engine over the native one, and by the clock each over the first:
+    seconds, their difference mission by mission, and moves on the missions that both solved.
+
+    By the clock of all sites together too, where there are several.
     """
-    found = []
+    found, together = [], dict[tuple[str, int, str], list[Row]]()
+    if len({key[:2] for key in groups}) > 1:
+        for (_, _, name), rows in groups.items():
+            if by_name[name].mode == "clock":
+                together.setdefault((ALL, 0, name), []).extend(rows)
+    groups = groups | together
     for (site, site_seed, name), rows in groups.items():
         for other in _others(by_name[name], by_name):
             before = {row.number: row for row in groups.get((site, site_seed, other), [])}
@@ -195,11 +206,14 @@ def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Co
 
 def _others(one: Contender, by_name: dict[str, Contender]) -> list[str]:
     """Names of the contenders that one is held against: by the clock, all those in steps that
-    decide robot by robot.
+    decide robot by robot, and the first by the clock.
     """
     if one.mode == "clock" and one.backend == "native":
-        return [name for name, other in by_name.items()
-                if (other.loop, other.mode, other.backend) == ("closed", "async", "native")]
+        first = next(name for name, other in by_name.items()
+                     if (other.mode, other.backend) == ("clock", "native"))
+        return [*(name for name, other in by_name.items()
+                  if (other.loop, other.mode, other.backend) == ("closed", "async", "native")),
+                *([first] if first != one.name else [])]
     changes = [{"mode": "barrier"}] if one.mode == "async" else []
     changes += [{"backend": "native"}] if one.backend != "native" else []
     return [msgspec.structs.replace(one, **change).name for change in changes]
@@ -282,7 +296,7 @@ def where(line: dict[str, Any]) -> str:
     """The ground of a line: preset or model with its seed, or the first and last of many; nothing
     of missions that were given.
     """
-    if line["site"] == GIVEN:
+    if line["site"] in (GIVEN, ALL):
         return line["site"]
     first = line["site_seed"]
     last = first + line.get("sites", 1) - 1

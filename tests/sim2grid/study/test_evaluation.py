@@ -485,6 +485,10 @@ def test_missions_that_unfold_are_driven_and_end_the_same_alone(tmp_path):
     for row in report["rows"]:
         assert row["report"]["success"], row["report"]
         assert row["report"]["replans"]["found"] >= 1
+    [line] = report["comparisons"]
+    assert line["over"] == "closed exact nearest clock"
+    assert line["both_solved"] == 2
+    assert [line["planner"] for line in report["summary"]] == ["exact nearest", "exact places"]
     code = main(["rollout", "--from", str(out / "report.json"), "--mission", "1", "--no-video",
                  "--contender", "closed exact places clock", "--out", str(tmp_path / "again")])
     assert code == 0

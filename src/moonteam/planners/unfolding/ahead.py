@@ -1,8 +1,9 @@
 """A policy that looks ahead: it plays what it would do, and what else it could, in many futures.
 
 Where targets follow on others, arrive by a clock or are hidden, or a robot may be lost, what is to
-come can be drawn, and the policy can go on in each of these futures by its likeliest choices to the end, thousands of them in one
-call of the macro world. That is one step of policy iteration, at the moment itself.
+come can be drawn, and the policy can go on in each of these futures by its likeliest choices to the
+end, thousands of them in one call of the macro world. That is one step of policy iteration, at the
+moment itself.
 
 Legend: B missions, K tries of a mission, F futures, R rollouts of a call, N robots, T targets, the
 open and then the coming ones, padded.
