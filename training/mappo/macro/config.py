@@ -208,8 +208,8 @@ PRESETS = {
     "unfolding_further": MacroConfig(
         # As any_team_further, and one policy for all that unfolds.
         "unfolding_further", (*COMING, HIDDEN),
-        rounds=180, hyper=replace(HYPER, ema=0.9995), vine=Vine(tau=0.5, lucky=True),
-        spec=PointerSpec(layers=5, unfolds=True), lr=1.5e-4),
+        rounds=240, hyper=replace(HYPER, ema=0.9995), vine=Vine(tau=0.5),
+        spec=PointerSpec(layers=5, unfolds=True), lr=2e-4),
     "searching": MacroConfig(
         "searching", (HIDDEN,),
         rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),

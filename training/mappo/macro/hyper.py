@@ -70,9 +70,6 @@ class Vine:
     """Weight of a moment beside the entropy of its choice, by which moments are drawn."""
     tau: float = 0.1
     """Weight of the divergence from the policy as it was, in units of time."""
-    lucky: bool = False
-    """Returns are as much luck as choice, as where missions unfold: the objective is climbed, in
-    place of fitting its maximiser."""
     minibatches: int = 16
     """Parts of a pass."""
     epochs: int = 2

@@ -8,11 +8,6 @@ policy then moves to the maximiser of the expected return under a Kullback-Leibl
 penalised objective of PPO, which among so few options can be solved exactly): the probability of
 an option tried becomes proportional to pi(a) exp(Q(a) / tau).
 
-Where a mission unfolds a branch is one future's, and Q is as much luck as choice. What such
-maximisers come to in the mean is then not the maximiser of the mean: exp favours options of which
-little is sure. There (`Vine.lucky`) gradients are of the penalised objective itself, which is
-linear in Q.
-
 Legend: I episodes, T decisions, S moments, K options tried of each, P places of the pool, N
 agents, M targets.
 """
@@ -59,8 +54,6 @@ class Branch(NamedTuple):
     who: Array  # [S] int32
     options: Array  # [S, M + 1] bool
     goal: Array  # [S, M + 1] probabilities to move to
-    before: Array  # [S, M + 1] log-probabilities of the policy as it was
-    gain: Array  # [S, M + 1] return of an option tried over those tried in the mean, in units
     value: Array  # [S] return of the likeliest course, in units
     real: Array  # [S] bool
 
@@ -193,18 +186,6 @@ def aim(vine: Vine, log_probs: Array, option: Array, valid: Array, value: Array)
     return jnp.exp(log_probs).at[row, column].set(moved, mode="drop")
 
 
-def over_mean(log_probs: Array, option: Array, valid: Array, value: Array) -> Array:
-    """[S, M + 1] return of each option tried less what the policy gets in the mean of them; 0 of
-    the others. Arguments as of `aim`.
-    """
-    old = jnp.take_along_axis(log_probs, option, axis=1)
-    share = jax.nn.softmax(jnp.where(valid, old, -FAR), axis=1)
-    mean = jnp.sum(jnp.where(valid, share * value, 0.0), axis=1, keepdims=True)
-    row = jnp.arange(len(option))[:, None]
-    column = jnp.where(valid, option, log_probs.shape[1])
-    return jnp.zeros_like(log_probs).at[row, column].set(value - mean, mode="drop")
-
-
 def grow(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine, ground: MacroProblem | None,
          params: Any, key: Array) -> tuple[Branch, Array]:
     """Moments with what to move to; and branches played, those of them solved, entropy, regret."""
@@ -217,32 +198,26 @@ def grow(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine, ground: Macr
     valid = jnp.take_along_axis(moments.options, option, axis=1) & moments.real[:, None]
     value, solved = tried(spec, hyper, vine, params, moments, option, valid)
     goal = aim(vine, moments.log_probs, option, valid, value)
-    gain = over_mean(moments.log_probs, option, valid, value)
 
     def mean(x: Array) -> Array:
         return jnp.sum(jnp.where(moments.real, x, 0.0)) / jnp.maximum(jnp.sum(moments.real), 1)
 
     best = jnp.max(jnp.where(valid, value, -FAR), axis=1)
-    branch = Branch(moments.view, moments.who, moments.options, goal, moments.log_probs, gain,
-                    value[:, 0], moments.real)
+    branch = Branch(moments.view, moments.who, moments.options, goal, value[:, 0], moments.real)
     return branch, jnp.stack([jnp.sum(valid), jnp.sum(solved), mean(moments.entropy),
                               mean(best - value[:, 0])])
 
 
-def loss(params: Any, spec: PointerSpec, hyper: Hyper, vine: Vine, rows: Branch,
+def loss(params: Any, spec: PointerSpec, hyper: Hyper, rows: Branch,
          count: Array) -> tuple[Array, Array]:
-    """Cross-entropy to what to move to, or the penalised objective in taus, and the critic's
-    squared error, which also stands alone.
+    """Cross-entropy to what to move to, and the critic's squared error, which also stands alone.
 
     A part's share of the mean over `count` moments.
     """
     said = point(params, spec, rows.view)
     own = jnp.take_along_axis(said.logits, rows.who[:, None, None], axis=1)[:, 0]
     log_probs, _ = among(own, rows.options)
-    told = rows.goal * log_probs
-    if vine.lucky:
-        told = jnp.exp(log_probs) * (rows.gain / vine.tau - (log_probs - rows.before))
-    told = jnp.where(rows.options & rows.real[:, None], told, 0.0)
+    told = jnp.where(rows.options & rows.real[:, None], rows.goal * log_probs, 0.0)
     off = jnp.where(rows.real, said.value - rows.value, 0.0)
     critic = 0.5 * jnp.sum(off**2) / count
     return hyper.vf_coef * critic - jnp.sum(told) / count, critic
@@ -258,7 +233,7 @@ def _on_each(spec: PointerSpec, family: Draw, hyper: Hyper, vine: Vine,
         jax.random.split(order_key, vine.epochs))
 
     def part_loss(params: Any, part: Branch, count: Array) -> tuple[Array, Array]:
-        return loss(params, spec, hyper, vine, part, count)
+        return loss(params, spec, hyper, part, count)
 
     learner, critic = descend(learner, hyper, part_loss, rows, rows.real,
                               order.reshape(vine.epochs * vine.minibatches, -1), lr)
