@@ -179,16 +179,6 @@ ANY_TEAM = MacroConfig(
     # Of many targets returns are long, and their squared error could drown the choices.
     rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5)
 
-COMING = (
-    Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),
-    Practice("3 + 5, the next by a clock",
-             Draw(targets=(8, 8), metric="straight", speeds=(1.5, 0.36, 0.47), arriving=5,
-                  every=10.0, limit=300.0)),
-)
-HIDDEN = Practice("5 hidden targets",
-                  Draw(targets=(5, 5), metric="straight", speeds=(1.5, 0.36, 0.47), looks=4,
-                       limit=600.0), shrink=2)
-
 PRESETS = {
     "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER),
     "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER),
@@ -202,16 +192,20 @@ PRESETS = {
             *(replace(one, advantages="tries", shrink=one.shrink // 2)
               for one in ANY_TEAM.families[6:]))),
     "unfolding": MacroConfig(
-        "unfolding", COMING,
+        "unfolding", (
+            Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),
+            Practice("3 + 5, the next by a clock",
+                     Draw(targets=(8, 8), metric="straight", speeds=(1.5, 0.36, 0.47),
+                          arriving=5, every=10.0, limit=300.0)),
+        ),
         # What comes makes returns noisy: a branch may move the policy less.
         rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
-    "unfolding_further": MacroConfig(
-        # As any_team_further, and one policy for all that unfolds.
-        "unfolding_further", (*COMING, HIDDEN),
-        rounds=240, hyper=replace(HYPER, ema=0.9995), vine=Vine(tau=0.5),
-        spec=PointerSpec(layers=5, unfolds=True), lr=2e-4),
     "searching": MacroConfig(
-        "searching", (HIDDEN,),
+        "searching", (
+            Practice("5 hidden targets", Draw(
+                targets=(5, 5), metric="straight", speeds=(1.5, 0.36, 0.47), looks=4,
+                limit=600.0), shrink=2),
+        ),
         rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
 }
 """By the word behind `moonteam train`."""
