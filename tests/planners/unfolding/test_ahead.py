@@ -19,6 +19,8 @@ from moonteam.planners.unfolding.pointing import Pointing
 from moonteam.planners.unfolding.search import with_looks
 from moonteam.planners.unfolding.world import World
 from moonteam.policies.policy import Policy
+from moonteam.problem import timed
+from moonteam.problem.timed import Agent, Loss, Prospect, Target, Timed
 
 POLICY = Policy.load(paths.find("unfolding", "policies", ".safetensors"))
 
@@ -178,3 +180,17 @@ def test_a_hidden_target_is_known_once_somebody_has_looked_from_near_it():
     if int(macro_world.coming(part)) == 0:
         assert not np.asarray(macro_world.open_targets(part))[len(view.targets)]
     assert bool(macro_world.finished(replace(state, solved=~np.asarray(problem.looks))))
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_who_may_be_lost_does_first_what_nobody_else_can(side):
+    """Two targets as far to either side: the one that any can serve may wait for the slow one."""
+    alone = Target((10.0 * side, 0.0), ("B",))
+    anybody = Target((-10.0 * side, 0.0), ("A", "B"), "OR")
+    problem = timed.check(Timed(
+        "seconds", (Agent((0.0, 0.0), ("B",)), Agent((0.0, 12.0), ("A",), 0.25)),
+        (anybody, alone), max_seconds=200.0,
+        expects=Prospect(area=(-10.0, 0.0, 10.0, 12.0), loss=Loss(0.9, 40.0))), "test")
+    view = World(problem).view()
+    (chosen,) = LookingAhead(POLICY, 64).choose([view])
+    assert chosen[0] == 1
