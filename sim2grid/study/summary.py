@@ -326,17 +326,19 @@ def tables(report: dict[str, Any]) -> list[Plain]:
                   ] if physical else ["-"] * 7
         rows.append(cells)
     found: list[Plain] = [(titles, rows)]
-    if clocked := [line for line in report["summary"] if line["mode"] == "clock"]:
+    clocked = [line for line in report["summary"] if line["mode"] == "clock"]
+    if planned := [line for line in clocked if line["planned"] is not None]:
         found.append((BY_THE_CLOCK, [[
             where(line), line["planner"], spread(line, "optimum", 1),
             spread(line, "planned", 1), spread(line, "seconds", 1), spread(line, "over_plan", 3),
-            spread(line, "slowdown", 3)] for line in clocked]))
+            spread(line, "slowdown", 3)] for line in planned]))
+    if spent := [line for line in clocked if line["driving_s"] is not None]:
         found.append((TIME_SPENT, [[
             where(line), line["planner"], spread(line, "seconds", 1),
             _value(line["driving_s"] - line["slower_s"], 1), spread(line, "slower_s", 1),
             spread(line, "service_s", 1),
             _value(line["seconds"] - line["driving_s"] - line["service_s"], 1),
-            _value(line["replans"], 2)] for line in clocked if line["driving_s"] is not None]))
+            _value(line["replans"], 2)] for line in spent]))
     if soft := [line for line in report["summary"] if line.get("expected_energy_j") is not None]:
         found.append((ON_SOIL, [[
             where(line), line["planner"], *(spread(line, key, 2) for key in ON_SOIL_KEYS[:2]),
