@@ -144,3 +144,15 @@ def test_an_interval_of_differences_is_that_of_the_missions_own():
     found = Bootstrap(50, 0).ratio((base + 1.0) - base, base)
     assert found.value == pytest.approx(1.0 / base.mean())
     assert found.high - found.low < 0.01
+
+
+def test_what_has_been_seen_grows_and_is_drawn(tmp_path):
+    assert main(["evaluate", "unfolding", "unfolding/hidden", "--limit", "3", "--search", "sweep",
+                 "--out", str(tmp_path / "out")]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    [row] = report["summary"]
+    share = row["seen"]["share"]
+    assert share == sorted(share)
+    assert 0.0 < share[0] < 0.5 < share[-1] <= 1.0
+    assert row["seen"]["seconds"][-1] <= max(one["seconds"] for one in report["rows"])
+    assert (tmp_path / "out" / "unfolding.png").stat().st_size > 10_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,10 +31,16 @@ def bars(path: Path, document: dict, panels: Sequence[tuple[str, str, float]]) -
       path: the PNG.
       document: an evaluation report.
       panels: (key of the summary row, title, factor on the value).
+
+    Where rows say how much of the ground had been seen when (`seen`), one panel more shows that.
     """
     rows = document["summary"]
-    width = 1.6 + 3.1 * len(panels)
-    figure, axes = _axes(width, 1.6 + 0.34 * len(rows), len(panels))
+    looked = [row for row in rows if "seen" in row]
+    count = len(panels) + bool(looked)
+    figure, axes = _axes(1.6 + 3.1 * count, max(1.6 + 0.34 * len(rows), 3.2 * bool(looked)), count)
+    if looked:
+        _coverage(axes[-1], looked)
+        axes = axes[:-1]
     places = np.arange(len(rows))[::-1]
     for axis, (key, title, factor) in zip(axes, panels, strict=True):
         for place, row in zip(places, rows, strict=True):
@@ -58,6 +65,17 @@ def bars(path: Path, document: dict, panels: Sequence[tuple[str, str, float]]) -
     figure.suptitle(document["title"], fontsize=11, x=0.01, ha="left", color=INK)
     with files.replacing(path) as temporary:
         figure.savefig(temporary, dpi=150)
+
+
+def _coverage(axis: Any, rows: Sequence[dict]) -> None:
+    """Mean share of the ground that has been seen over mission seconds, a line a row."""
+    for row in rows:
+        axis.plot(row["seen"]["seconds"], row["seen"]["share"], lw=1.6, label=row["planner"])
+    axis.set_title("share of the ground seen, over seconds", fontsize=10, loc="left", color=INK)
+    axis.set_ylim(0.0, 1.02)
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(fontsize=7, frameon=False, loc="lower right")
 
 
 LINES = {"exact(makespan)": ("#2867b2", "-", "o"), "exact(moves)": ("#2867b2", "--", "s"),

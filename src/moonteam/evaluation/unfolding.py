@@ -51,6 +51,8 @@ from moonteam.report.tables import Column
 PANELS = (("gap", "seconds over the first row, %", 100.0),
           ("waited_gap", "waiting over the first row, %", 100.0),
           ("success", "success", 1.0))
+COVERAGE = 61
+"""Points of the line that says how much of the ground has been seen."""
 COLUMNS = (
     Column("success", "success", lambda value: f"{value:.3f}"),
     Column("seconds", "mean seconds", lambda value: f"{value:.2f}"),
@@ -234,7 +236,17 @@ def summary(row: Row, played: Sequence[Played], first: Sequence[Played], bound: 
     return {"planner": row.name, "missions": len(played),
             **{key: figure.value for key, figure in found.items()},
             "intervals": {key: [figure.low, figure.high] for key, figure in found.items()},
-            "decision_seconds": column("took").sum() / max(column("decisions").sum(), 1.0)}
+            "decision_seconds": column("took").sum() / max(column("decisions").sum(), 1.0),
+            **({"seen": coverage(played)} if any(one.seen for one in played) else {})}
+
+
+def coverage(played: Sequence[Played]) -> dict[str, list[float]]:
+    """Mean share of the ground that has been seen, at even seconds until nine missions of ten are
+    over; what one has seen at its end stays.
+    """
+    seconds = np.linspace(0.0, float(np.quantile([one.seconds for one in played], 0.9)), COVERAGE)
+    each = [np.interp(seconds, *zip(*one.seen, strict=True)) for one in played]
+    return {"seconds": seconds.round(2).tolist(), "share": np.mean(each, 0).round(4).tolist()}
 
 
 def _played(problems: Sequence[Timed], row: Row, seed: int, kept: Kept) -> list[Played]:

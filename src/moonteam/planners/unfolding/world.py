@@ -139,6 +139,7 @@ class World:
         if self.state.ground is not None and self.state.now == 0:
             for at, sensor in self._eyes():
                 self.state.ground.see(np.array([at, at]), sensor)
+            self.outcome.seen.append((0.0, self.state.ground.share))
         self._settle()
 
     # What is done.
