@@ -245,7 +245,8 @@ def coverage(played: Sequence[Played]) -> dict[str, list[float]]:
     over; what one has seen at its end stays.
     """
     seconds = np.linspace(0.0, float(np.quantile([one.seconds for one in played], 0.9)), COVERAGE)
-    each = [np.interp(seconds, *zip(*one.seen, strict=True)) for one in played]
+    known = (np.array(one.seen).T for one in played)
+    each = [np.interp(seconds, at, share) for at, share in known]
     return {"seconds": seconds.round(2).tolist(), "share": np.mean(each, 0).round(4).tolist()}
 
 
