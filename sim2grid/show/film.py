@@ -298,8 +298,9 @@ class Film:
             words = "true speed" if abs(speed - 1.0) < 0.05 else f"{speed:.2g} times true speed"
             put(image, (x + wide + 14 * u, y + 10 * u), words, round(17 * u), DIM)
         done = len(moment.solved)
-        wide = put(image, (x, y + 44 * u), f"{done} of {_many(moment.targets, 'target')} solved",
-                   round(17 * u), SOLVED if done == moment.targets else INK)
+        said = f"{done} of {_many(moment.targets, 'target')} solved"
+        wide = put(image, (x, y + 44 * u), said if moment.targets else "no target known yet",
+                   round(17 * u), SOLVED if moment.targets and done == moment.targets else INK)
         if moment.replans:
             pen = ImageDraw.Draw(image, "RGBA")
             draw_replan(pen, (x + wide + 20 * u, y + 56 * u), 8 * u)
@@ -312,6 +313,8 @@ class Film:
         the list ends.
         """
         u, (x, y) = self.unit, at
+        if not moment.targets:
+            return y
         bottom = self.height - (CHIP[1] + 2 * MARGIN) * u
         columns = 1 if (bottom - y) / max(moment.targets, 1) >= 15 * u else 2
         lines = max(1, math.ceil(moment.targets / columns))
