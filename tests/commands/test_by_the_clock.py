@@ -177,3 +177,11 @@ def test_missions_by_the_clock_stand_beside_those_in_steps_and_are_made_again(ca
                      str(tmp_path / "again"))
     assert report == clock["report"]
     assert json.loads((out / "report.json").read_text())["summary"][1]["optimum"] > 0
+
+
+def test_a_mission_of_which_nothing_is_known_is_not_planned(capsys):
+    assert main(["plan", "search"]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert "search: targets: nothing to plan" in err
+    assert err.count("\n") == 1

@@ -69,6 +69,9 @@ def ground_of(mission: Mission) -> Ground:
     from moonteam.terrain.site import for_mission
     from moonteam.terrain.travel import Roads
 
+    if not mission.targets:
+        raise InputError(mission.name, "nothing to plan: no target is known at the start; "
+                         "moonteam rollout drives it and decides as they come", "targets")
     named, kinds = team.resolve(mission, mission.name)
     if named.clock == "steps" and named.events:
         named = msgspec.structs.replace(named, events=())
