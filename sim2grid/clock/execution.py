@@ -153,7 +153,7 @@ class TimedExecution:
         self.errands = [Errand.idle(xy, 0.0) for xy in self.known.xy]
         self.book.points = self.known.xy.copy()
         if self.unfolding is not None:
-            self.unfolding.see(self.known.xy, self.known.xy, self.known.mask, 0.0)
+            self.unfolding.see(self.known.xy, self.known.xy, self.known.mask)
         self._happenings.apply()
         self.planner.reset(self.moment(), self.asked.seed)
         self._next()
@@ -197,7 +197,7 @@ class TimedExecution:
             self.lose(i, "battery")
         self._progress(poses[0, :, :2], poses[-1, :, :2], seconds)
         if self.unfolding is not None:
-            self.unfolding.see(poses[0, :, :2], known.xy, known.mask, book.time)
+            self.unfolding.see(poses[0, :, :2], known.xy, known.mask)
         self._serve()
         self._happenings.apply()
         self._end_if_over()
@@ -383,8 +383,8 @@ class TimedExecution:
             if errand.phase != "going" or not known.mask[i]:
                 continue
             done = errand.drive(known.xy[i])
-            if errand.look is not None and (law.metres(known.xy[i] - errand.look)
-                                            < SOON_S * known.speeds[i] + rules.arrive_cells):
+            close = rules.arrive_cells * self.asked.frame.cell_m + SOON_S * known.speeds[i]
+            if errand.look is not None and law.metres(known.xy[i] - errand.look) < close:
                 self.ask()
             if there[i] and len(errand.points) <= 2:
                 self.book.close(i, "arrived")

@@ -63,17 +63,15 @@ class Unfolding:
         self._expects = msgspec.structs.replace(
             expects, area=(corners[0], corners[1], corners[2], corners[3]))
         self.ground = Ground.of(self._problem(task.starts, task.speeds))
-        self.seen: list[tuple[float, float]] = []  # mission second, share of the area
         self._known_at: list[int] = []
 
-    def see(self, before: Floats, after: Floats, present: Bools, now: float) -> None:
+    def see(self, before: Floats, after: Floats, present: Bools) -> None:
         """Takes the way that robots came, from and to [R, 2] m."""
         if self.ground is None:
             return
         for i, reach in enumerate(self._sensors):
             if reach is not None and present[i]:
                 self.ground.see(np.stack([before[i], after[i]]), reach)
-        self.seen.append((now, self.ground.share))
 
     def view(self, moment: Moment, at: Floats, speeds: Floats, errands: Sequence[Errand],
              now: float, coming: int) -> View:

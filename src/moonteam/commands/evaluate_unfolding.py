@@ -106,7 +106,7 @@ def run(args: Args) -> int:
     from moonteam.report import command, journal
 
     found, hidden, ahead = _missions(args)
-    patterns = args.search or (tuple(PATTERNS) if hidden else ())
+    patterns = args.search or (PATTERNS if hidden else ())
     rows = unfolding.rows_of(timed.contenders(options_of(args)), args.futures, patterns, args.goal,
                              ahead, args.foresee)
     kept = journal.Kept.of(args.out, args.resume, command.figures(args), FILES)

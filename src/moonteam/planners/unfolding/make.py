@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import TimedPlanner
 from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.planners.seconds.keeper import HOME
 from moonteam.planners.seconds.policy import PolicyPlanner
 from moonteam.planners.unfolding.ahead import LookingAhead
 from moonteam.planners.unfolding.deciders import Choose, Decider, Goal, OverFutures, Replanning
@@ -21,9 +21,16 @@ from moonteam.planners.unfolding.world import View
 Search = Literal["nearest", "sweep", "places", "stay", "middle"]
 """How is looked for what is hidden; where nothing is, where who has nothing to do waits."""
 
-PATTERNS: dict[str, Callable[[], Pattern]] = {"nearest": NearestUnseen, "sweep": Sweep}
+PATTERNS = ("nearest", "sweep")
+"""Those that say where to look next."""
+PLACES = "places"
+"""Places to look from are planned for as if they were targets."""
 STAY, MIDDLE = "stay", "middle"
 """Where nothing is hidden: where it is, or where the next target is soonest reached in the mean."""
+ALL_AT_ONCE = ("", STAY, MIDDLE, PLACES)
+"""By which a policy can look ahead in the macro world."""
+NEAR_M = 1e-6
+"""m at which a robot is where it was to look from; of bodies more."""
 
 
 def check_search(search: str, hidden: bool, option: str = "--search") -> None:
@@ -33,14 +40,6 @@ def check_search(search: str, hidden: bool, option: str = "--search") -> None:
         raise InputError(f"{option} {search}", "has no effect where "
                          + ("targets are hidden" if hidden else "no target is hidden")
                          + f"; {ways[not hidden]}")
-NEAR_M = 1e-6
-"""m at which a robot is where it was to look from; of bodies more."""
-PLACES = "places"
-"""Beside the patterns: places to look from are planned for as if they were targets."""
-
-
-ALL_AT_ONCE = ("", STAY, MIDDLE, PLACES)
-"""By which a policy can look ahead in the macro world."""
 
 
 class Choosing:
@@ -53,7 +52,7 @@ class Choosing:
         """See `deciders.Decider`."""
         view = self._rest.shown(view)
         if view.moment.solved.all():
-            return self._rest.settled(view, np.full(len(view.places), -1))
+            return self._rest.settled(view, np.full(len(view.places), HOME))
         return self._rest.settled(view, self._choose([view])[0])
 
 
@@ -66,9 +65,9 @@ def pointing(planner: TimedPlanner) -> Choose | None:
 
 def searching(search: str, near_m: float = NEAR_M) -> Pattern | None:
     """A fresh pattern, for it remembers its mission; None of `PLACES` and where none is."""
-    if search in ("sweep", MIDDLE):
-        return Sweep(near_m) if search == "sweep" else Middle()
-    return PATTERNS[search]() if search in PATTERNS else None
+    made: dict[str, Pattern] = {
+        "nearest": NearestUnseen(), "sweep": Sweep(near_m), MIDDLE: Middle()}
+    return made.get(search)
 
 
 def decider_of(planner: TimedPlanner, *, search: str = "", futures: int = 0,
