@@ -19,7 +19,7 @@ TITLES = ("success, argmax", "makespan over the optimum, argmax")
 
 def over_minutes(axes: Sequence[Axes], titles: Iterable[str]) -> None:
     """Dresses axes of the success, of the gap to the optimum and of others, over log minutes."""
-    from matplotlib.ticker import PercentFormatter
+    from matplotlib.ticker import FuncFormatter, PercentFormatter
 
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title)
@@ -29,7 +29,8 @@ def over_minutes(axes: Sequence[Axes], titles: Iterable[str]) -> None:
         _logarithmic(axis.xaxis, "{x:g}")
     axes[0].yaxis.set_major_formatter(PercentFormatter(1.0))
     axes[1].set_yscale("log")
-    _logarithmic(axes[1].yaxis, PercentFormatter(1.0, decimals=0))
+    # Where little changes, ticks lie closer than a percent.
+    _logarithmic(axes[1].yaxis, FuncFormatter(lambda value, _: f"{100 * value:.3g}%"))
 
 
 def _logarithmic(axis: Axis, form: Any) -> None:
