@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import msgspec
 import numpy as np
 import pytest
 
@@ -194,3 +195,16 @@ def test_who_may_be_lost_does_first_what_nobody_else_can(side):
     view = World(problem).view()
     (chosen,) = LookingAhead(POLICY, 64).choose([view])
     assert chosen[0] == 1
+
+
+def test_ways_to_places_are_each_robots_own_whatever_the_classes():
+    """On the ground every robot is a class of its own, also two of the same speed."""
+    problem = missions("hidden", 1)[0]
+    agents = tuple(msgspec.structs.replace(a, speed=v)
+                   for a, v in zip(problem.agents, (1.5, 0.36, 1.5), strict=True))
+    view = World(msgspec.structs.replace(problem, agents=agents)).view()
+    usual, own = view.moment, np.arange(3)
+    ground = replace(usual, classes=own, between=usual.between[usual.classes])
+    by_speed, by_robot = (with_looks(replace(view, moment=m)).moment for m in (usual, ground))
+    np.testing.assert_array_equal(by_robot.between, by_speed.between[by_speed.classes])
+    assert by_robot.between[0].max() < by_robot.between[1].max()

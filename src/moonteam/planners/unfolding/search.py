@@ -162,7 +162,8 @@ def with_looks(view: View) -> View:
     speeds = np.array([agent.speed for agent in view.agents])
     eyes = np.array([agent.sensor is not None for agent in view.agents])
     far = distances(spots, spots, metric)
-    between = np.stack([ms(far, speed) for speed in sorted(set(speeds.tolist()))])
+    of_class = [speeds[now.classes == c][0] for c in range(len(now.between))]
+    between = np.stack([ms(far, speed) for speed in of_class])
     between[:, :targets, :targets] = now.between
     need = np.zeros((targets + more, now.need.shape[1] + 1), np.int64)
     need[:targets, :-1], need[targets:, -1] = now.need, 1
