@@ -7,7 +7,14 @@ import msgspec
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import TimedPlanner
 from moonteam.planners.seconds.keeper import MARGIN_MS, Keeper
-from moonteam.planners.unfolding.make import PLACES, Search, check_search, decider_of, pointing
+from moonteam.planners.unfolding.make import (
+    PLACES,
+    Search,
+    check_futures,
+    check_search,
+    decider_of,
+    pointing,
+)
 from moonteam.problem.mission import Mission
 from moonteam.robots import team
 from moonteam.terrain.travel import Roads
@@ -41,6 +48,8 @@ def choosing(planner: TimedPlanner, mission: Mission, search: Search | None = No
                                  "says nothing of what nobody knows yet (expects, on_sight, "
                                  "at_solved)")
         return Keeper(planner)
+    if futures:
+        check_futures(futures)
     if search:
         check_search(search, mission.searches)
     if mission.searches and search is None:

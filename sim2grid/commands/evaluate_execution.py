@@ -38,8 +38,6 @@ DRAWN = ("team", "site", "sites", "count", "cell", "lose", "slow", "silent", "ne
          *(field.name for field in fields(Elevation)))
 """Options of random missions, which a mission that is given answers itself."""
 
-MOST_FUTURES = 4096
-
 FILES = ("config.json", "rows.jsonl", "report.json", "report.html", "rows.csv", "table.md")
 """In --out."""
 
@@ -209,9 +207,6 @@ def _check(args: Args) -> None:
             if getattr(args, name):
                 raise InputError(command.flag(name), "comes at decisions; --unfold says by the "
                                  "clock what happens")
-    for count in args.futures:
-        if not 2 <= count <= MOST_FUTURES:
-            raise InputError("--futures", f"{count} is not allowed; 2 to {MOST_FUTURES}")
 
 
 def _evaluation(args: Args, given: list[Given]) -> Evaluation:

@@ -43,7 +43,6 @@ FILES = ("report.html", "video.mp4", "video.webp", "video.gif", "map.mp4", "map.
          "config.json")
 """In --out."""
 MOST_ROWS = 1000
-MOST_FUTURES = 4096
 
 
 @dataclass(frozen=True)
@@ -362,8 +361,6 @@ def _check(args: Args) -> None:
         raise InputError("--seed", f"{args.seed} is not allowed; at least 0")
     parse(args.decode)
     filming.check(args)
-    if args.futures and not 2 <= args.futures <= MOST_FUTURES:
-        raise InputError("--futures", f"{args.futures} is not allowed; 2 to {MOST_FUTURES}, or 0")
     if args.row is not None and not 0 <= args.row[0] < args.row[1] <= MOST_ROWS:
         raise InputError("--row", f"{args.row[0]} {args.row[1]} is not allowed; a row from 0, and "
                          f"how many there are, at most {MOST_ROWS}")

@@ -38,7 +38,7 @@ from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.base import MS, Moment
 from moonteam.planners.seconds.keeper import Keeper
-from moonteam.planners.unfolding.make import PLACES, Search
+from moonteam.planners.unfolding.make import PLACES, Search, check_futures
 from moonteam.policies.brain import PointerBrain
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
@@ -205,7 +205,7 @@ class Evaluation:
                         for k, draws in enumerate(fleet.draws)]
         unlike = {(m.unfolds, m.searches): m for fleet in self._fleets for m in fleet.missions}
         for contender, mission in itertools.product(self.contenders, unlike.values()):
-            if contender.mode == "clock":
+            if contender.mode == "clock" and (contender.search or contender.futures):
                 chooser(contender, mission)
 
     def run(self) -> None:
@@ -478,7 +478,12 @@ def _ideal(fleet: Fleet, k: int, execution: Execution, bodies: Sequence[Any]) ->
 
 def unfolded(rows: Sequence[Contender], searches: Sequence[Search], futures: Sequence[int]
              ) -> list[Contender]:
-    """Rows by the clock in missions that unfold: by every way to search, and over futures too."""
+    """Rows by the clock in missions that unfold: by every way to search, and over futures too.
+
+    Raises InputError for a number of futures that is none.
+    """
+    for count in futures:
+        check_futures(count)
     found = []
     for row, search in itertools.product(rows, searches or (None,)):
         for count in (0, *futures):

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import MS, TimedPlanner, enough, moment
 from moonteam.planners.seconds.policy import PolicyPlanner
@@ -35,6 +34,7 @@ from moonteam.planners.unfolding.make import (
     ALL_AT_ONCE,
     PLACES,
     STAY,
+    check_futures,
     decider_of,
     pointing,
     searching,
@@ -168,8 +168,7 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
     Raises InputError for a number of futures that is none.
     """
     for count in futures:
-        if not 2 <= count <= 4096:
-            raise InputError("--futures", f"{count} is not allowed; 2 to 4096")
+        check_futures(count)
     found = []
     for one in contenders:
         points = pointing(one.planner) is not None

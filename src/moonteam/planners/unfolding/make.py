@@ -29,17 +29,24 @@ STAY, MIDDLE = "stay", "middle"
 """Where nothing is hidden: where it is, or where the next target is soonest reached in the mean."""
 ALL_AT_ONCE = ("", STAY, MIDDLE, PLACES)
 """By which a policy can look ahead in the macro world."""
+MOST_FUTURES = 4096
 NEAR_M = 1e-6
 """m at which a robot is where it was to look from; of bodies more."""
 
 
-def check_search(search: str, hidden: bool, option: str = "--search") -> None:
+def check_search(search: str, hidden: bool) -> None:
     """Raises InputError for a way to search where nothing is hidden, or to wait where it is."""
     if hidden == (search in (STAY, MIDDLE)):
         ways = ("nearest, sweep, places", "stay, middle")
-        raise InputError(f"{option} {search}", "has no effect where "
+        raise InputError(f"--search {search}", "has no effect where "
                          + ("targets are hidden" if hidden else "no target is hidden")
                          + f"; {ways[not hidden]}")
+
+
+def check_futures(count: int) -> None:
+    """Raises InputError for a number of futures that is none."""
+    if not 2 <= count <= MOST_FUTURES:
+        raise InputError("--futures", f"{count} is not allowed; 2 to {MOST_FUTURES}")
 
 
 class Choosing:
