@@ -348,9 +348,9 @@ def draw_mission(recipe: Recipe, number: int, site: Ground,
         if plan := _allowed(mission, site, passable, planner, kinds):
             events = _draw_events(recipe.rates, mission, grid_problem(mission, passable), plan,
                                   rng, kinds)
-            done = msgspec.structs.replace(mission, events=events)
-            if recipe.unfold is not None:
-                done = _unfolding(recipe, mission, passable, rng)
+            # Without rates nothing comes of these; by the clock other things do.
+            done = (msgspec.structs.replace(mission, events=events) if recipe.unfold is None
+                    else _unfolding(recipe, mission, passable, rng))
             return missions.check(done, done.name), draws
     share = ", ".join(f"{name} {100 * cells.mean():.0f} %" for name, cells in passable.items())
     raise InputError(recipe.source, f"allows none of {MOST_DRAWS} random missions; cells open to: "
