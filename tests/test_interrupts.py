@@ -141,3 +141,28 @@ def test_an_exception_that_python_drops_is_raised_again():
 def test_what_was_ignored_at_the_start_is_ignored():
     code, out, _, _ = run("import time; time.sleep(2)", signal.SIGINT, ignored=[signal.SIGINT])
     assert (code, out) == (0, "")
+
+
+HALF_MADE = """
+    class Made:
+        def __init__(self):
+            {wait}
+            self.inside = 1
+        def __del__(self):
+            del self.inside
+    try:
+        Made()
+    except OSError:
+        pass
+    {after}"""
+
+
+def test_what_an_interruption_left_half_made_ends_without_a_word():
+    """As libraries' objects do whose `__init__` was interrupted; a failure of theirs is shown."""
+    work = HALF_MADE.format(wait="import time; time.sleep(100)", after="").strip()
+    code, out, err, _ = run(work, signal.SIGINT)
+    assert (code, out, err) == (130, "saved\n", "moonteam: interrupted\n")
+    work = HALF_MADE.format(wait="raise OSError", after="import time; time.sleep(100)").strip()
+    code, out, err, _ = run(work, signal.SIGINT)
+    assert (code, out) == (130, "saved\n")
+    assert "AttributeError" in err

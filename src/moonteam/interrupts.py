@@ -46,6 +46,7 @@ class _State:
     asked: int = 0  # signals so far
     number: int = signal.SIGINT  # the last
     sent: int = 0  # those of them that are our own
+    raised: bool = False  # KeyboardInterrupt, somewhere
     held: bool = False  # work is done that is lost if the process leaves at once
     saved: str = ""  # what is on the disk by now, in words
     said: bool = False  # that it was interrupted
@@ -191,13 +192,19 @@ def _answer(number: int, frame: FrameType | None) -> None:
     if _now.stop is not None and _now.held and not _now.stop.asked:
         _now.stop.asked = True
         return
+    _now.raised = True
     raise KeyboardInterrupt
 
 
 def _dropped(hook: Callable[[Any], object], state: _State, what: Any) -> None:
-    """Sends the signal again where Python had to drop the exception: where an object ends."""
+    """Sends the signal again where Python had to drop the exception: where an object ends.
+
+    What else is dropped after one was raised comes of objects that it left half made: nobody needs
+    to read it.
+    """
     if what.exc_type is not KeyboardInterrupt:
-        hook(what)
+        if not state.raised:
+            hook(what)
         return
 
     def again() -> None:
