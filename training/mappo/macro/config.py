@@ -115,8 +115,8 @@ class MacroConfig:
 
     def grown(self, family: Practice) -> Vine:
         """Of a family: fewer moments of large problems, in fewer minibatches of the same size."""
-        vine, most = self.vine, family.draw.entries
-        steps = vine.num_steps or 2 * most
+        vine = self.vine
+        steps = vine.num_steps or family.draw.turns
         # As many decisions as the paper's team would take, in episodes of this length.
         episodes = vine.episodes // family.shrink * (vine.num_steps or 14) // steps
         return replace(vine, num_steps=steps, episodes=max(8, episodes // 8 * 8),
@@ -125,7 +125,7 @@ class MacroConfig:
 
     def tried(self, family: Practice) -> Tries:
         """Of a family: fewer large problems."""
-        return replace(self.tries, num_steps=self.tries.num_steps or 2 * family.draw.entries,
+        return replace(self.tries, num_steps=self.tries.num_steps or family.draw.turns,
                        problems=self.tries.problems // family.shrink)
 
     def envs(self, family: Practice) -> int:
@@ -149,6 +149,9 @@ class MacroConfig:
 
 
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())
+CREW = Draw(agents=(6, 12), targets=(8, 20), num_skills=1, metric="straight", numbers=5,
+            service=1.9, homes=1.0, crews=(1, 1), limit=8000.0)
+"""Robots that start together and are needed several at once, as in others' instances."""
 HYPER = Hyper(loose=0.2)
 
 ANY_TEAM = MacroConfig(
@@ -191,6 +194,19 @@ PRESETS = {
             # Of many robots and targets whole tries say more than branches, and are cheap enough.
             *(replace(one, advantages="tries", shrink=one.shrink // 2)
               for one in ANY_TEAM.families[6:]))),
+    "crews": MacroConfig(
+        "crews", (
+            Practice("6 to 12 robots of one kind, 8 to 20 targets for up to 5", CREW,
+                     shrink=4, advantages="tries"),
+            Practice("20 robots of one kind, 50 targets for up to 5",
+                     replace(CREW, agents=(10, 20), targets=(20, 50)), shrink=32,
+                     advantages="tries"),
+            Practice("9 to 15 robots of 3 to 5 kinds, 10 to 20 targets",
+                     replace(CREW, agents=(9, 15), targets=(10, 20), crews=(3, 5), num_skills=5,
+                             numbers=1), shrink=8, advantages="tries"),
+        ),
+        rounds=300, hyper=replace(HYPER, vf_coef=0.05), spec=PointerSpec(layers=5), lr=3e-4,
+        chunk_rounds=2, eval_every=5, eval_scenarios=128),
     "unfolding": MacroConfig(
         "unfolding", (
             Practice("5 + 5, the next when one is solved", Draw(targets=(10, 10), following=5)),

@@ -104,6 +104,11 @@ class Draw:
     """Most agents that a target of a single skill may need, in half of the problems."""
     homes: float = 0.0
     """Share of problems in which every robot has to be back where it started."""
+    crews: tuple[int, int] = (0, 0)
+    """Fewest and most kinds of robots, each with a skill of its own and one place where all of it
+    start; a target asks for one robot each of some of the kinds. Services, and of a single kind
+    up to `numbers` robots, are then asked for in all problems. 0: skills and places are every
+    robot's own."""
     limit: float = 128.0
     """s in which everything must be done."""
     following: int = 0
@@ -129,6 +134,11 @@ class Draw:
         return self.targets[1] + self.looks**2
 
     @property
+    def turns(self) -> int:
+        """Decisions after which an episode should have ended."""
+        return (4 if self.crews[1] > 1 else 2) * self.entries  # those of a crew go together
+
+    @property
     def config(self) -> EnvConfig:
         """The grid's family with the largest team, most targets and largest map."""
         return EnvConfig(num_agents=self.agents[1], num_targets=self.targets[1],
@@ -143,6 +153,8 @@ def draw(family: Draw, key: Array) -> MacroProblem:
     side = jax.random.randint(size, (), family.sides[0], family.sides[1] + 1)
     problem, cells = sample(family.config, pose, number, count, jnp.stack([side, side]))
     speed, skills = paces(family, pace), family.num_skills
+    if family.crews[1]:
+        problem, cells = in_crews(family, problem, cells, jax.random.fold_in(more, 2))
     if family.looks:
         problem, skills = looked_for(family, problem), skills + 1
     if family.metric == "either":
@@ -156,6 +168,19 @@ def draw(family: Draw, key: Array) -> MacroProblem:
     if family.unfolds:
         made = unfolding(family, made, problem, cells, speed, jax.random.fold_in(more, 1))
     return trees.single(made)
+
+
+def in_crews(family: Draw, problem: Problem, cells: Array, key: Array) -> tuple[Problem, Array]:
+    """The problem with robots of few kinds that start together, and targets that ask for those."""
+    some, need = jax.random.split(key)
+    kinds = jax.random.randint(some, (), family.crews[0], family.crews[1] + 1)
+    kinds = jnp.minimum(kinds, jnp.sum(problem.agent_mask))
+    kind = jnp.arange(problem.agent_mask.shape[0]) % kinds
+    asked = jax.random.randint(need, problem.target_mask.shape, 1, 2**kinds)
+    return replace(
+        problem, agent_skills=jnp.where(problem.agent_mask, 1 << kind, 0),
+        target_skills=jnp.where(problem.target_mask, asked, 0),
+        target_and=problem.target_mask), cells[kind]
 
 
 def looked_for(family: Draw, problem: Problem) -> Problem:
@@ -228,15 +253,16 @@ def paces(family: Draw, key: Array) -> Array:
 def asking(family: Draw, problem: MacroProblem, key: Array) -> MacroProblem:
     """The problem with services, coalitions by number and homes, as the family asks."""
     length, some, team, many, home = jax.random.split(key, 5)
-    targets = problem.start.shape[1]
+    targets, always = problem.start.shape[1], family.crews[1] > 0
     if family.service:
-        longest = family.service * problem.unit * jax.random.bernoulli(some)
+        longest = family.service * problem.unit * (jax.random.bernoulli(some) | always)
         problem = replace(problem, service=longest * jax.random.uniform(length, (targets,)))
     if family.numbers > 1:
         able = problem.has & problem.agent_mask[:, None]
         have = jnp.sum(jnp.where(problem.need > 0, jnp.sum(able, axis=0)[None], 0), axis=1)  # [M]
         wanted = jax.random.randint(many, (targets,), 1, family.numbers + 1)
-        wanted = jnp.where(jax.random.bernoulli(team), jnp.clip(wanted, 1, have), 1)
+        team_wanted = jax.random.bernoulli(team) | always
+        wanted = jnp.where(team_wanted, jnp.clip(wanted, 1, have), 1)
         single = jnp.sum(problem.need > 0, axis=1) == 1
         need = jnp.where(single[:, None], problem.need * wanted[:, None], problem.need)
         problem = replace(problem, need=need, either=problem.either & ~(single & (wanted > 1)))
