@@ -95,6 +95,25 @@ def test_what_nobody_can_do_is_said_and_the_rest_is_done(make):
     assert now.solved.tolist() == [True, False, True, True]
 
 
+def test_what_saves_way_and_comes_too_late_is_not_planned():
+    """Where no course of the preference is in time, one that saves less way is taken."""
+    planner = registry.make("policy", PlannerOptions(policy="any_team_mappo", preference=1.0))
+    moments = [Snapshot.start(scenarios.generate(
+        seed, num_agents=4, num_targets=10, size=(16, 16), max_steps=256)) for seed in range(8)]
+    free = Batch(planner, moments).actions()
+    tight = [replace(now, max_steps=len(actions) - 1)
+             for now, actions in zip(moments, free, strict=True)]
+    plans = [planner.plan(now) for now in tight]
+    sped = [plan for plan in plans if plan.status == "feasible"]
+    assert len(sped) >= 4
+    assert all(plan.makespan < len(actions)
+               for plan, actions in zip(plans, free, strict=True) if plan in sped)
+    batch = Batch(planner, tight).actions()
+    assert [simulate.replay(now, actions).makespan for now, actions, plan
+            in zip(tight, batch, plans, strict=True) if plan in sped] == [
+                plan.makespan for plan in sped]
+
+
 def test_too_few_steps_are_no_plan(make):
     assert make().plan(replace(moment(), max_steps=2)).status == "infeasible"
 

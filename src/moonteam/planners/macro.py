@@ -13,7 +13,7 @@ M targets, S skills.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ _PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of the 
 FEW = 8.0
 """Targets up to which all tries of a problem are as hot as asked for."""
 _CHUNK = 4096  # episodes of a call, more only if one problem's tries are
+_LESS = 0.25  # of the preference, where what it asks for comes too late
 _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": "NS",
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
          "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "",
@@ -125,6 +126,7 @@ def unit_of(start: npt.NDArray, has: npt.NDArray, need: npt.NDArray) -> np.float
 
 def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: float = 0.0,
              cooling: bool = False, seed: int = 0, preference: float = 0.0,
+             within: npt.ArrayLike = np.inf,
              tick: Callable[[int], object] = lambda episodes: None) -> Rollouts:
     """Plays every problem `tries` times from its beginning to its end.
 
@@ -142,7 +144,10 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
         it, the more targets the cooler, see `coolest`.
       seed: of the draws.
       preference: 0 time .. 1 effort.
-      tick: told how many episodes have ended, now and then.
+      within: [B] or [], s in which a try has to solve everything. What saves way may come too
+        late, and then saves nothing: a problem no try of which is in time is played again with
+        less of the preference, by quarters, at last for time alone.
+      tick: told how many episodes have ended, now and then; not of those played again.
 
     Raises:
       InputError: the policy is of another kind, or that is no number of tries.
@@ -150,16 +155,31 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
     if not 1 <= tries <= MOST_ROLLOUTS:
         raise InputError("rollouts", f"{tries} is not allowed; 1 to {MOST_ROLLOUTS}")
     play = _Call.of(policy, problems, tries)
-    count = len(problems.limit)
-    parts = []
-    for first in range(0, count, play.rows):
-        real = min(play.rows, count - first)
-        done = play(problems, first, real, heat, cooling, seed, preference)
-        parts.append(jax.tree.map(
-            lambda x, n=real: x.reshape(play.rows, tries, *x.shape[1:])[:n], done))
-        tick(real * tries)
-    whole: _Done = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return _routed(problems, whole)
+
+    def played(problems: MacroProblem, preference: float,
+               tick: Callable[[int], object]) -> Rollouts:
+        count, parts = len(problems.limit), []
+        for first in range(0, count, play.rows):
+            real = min(play.rows, count - first)
+            done = play(problems, first, real, heat, cooling, seed, preference)
+            parts.append(jax.tree.map(
+                lambda x, n=real: x.reshape(play.rows, tries, *x.shape[1:])[:n], done))
+            tick(real * tries)
+        whole: _Done = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        return _routed(problems, whole)
+
+    found = played(problems, preference, tick)
+    limit = np.broadcast_to(within, problems.limit.shape)[:, None]
+    while preference > 0.0:
+        late = np.flatnonzero(~(found.solved & (found.seconds <= limit)).any(1))
+        if not len(late):
+            break
+        preference = max(preference - _LESS, 0.0)
+        again = played(jax.tree.map(lambda x, at=late: x[at], problems), preference,
+                       lambda episodes: None)
+        for one in fields(Rollouts):
+            getattr(found, one.name)[late] = getattr(again, one.name)
+    return found
 
 
 def warm(policy: Policy, problems: MacroProblem, tries: int = 1) -> None:

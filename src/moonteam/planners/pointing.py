@@ -40,11 +40,15 @@ def problem_of(task: Task) -> MacroProblem:
                  unit=macro.unit_of(start, has, need))
 
 
+def _within(horizons: Sequence[int]) -> np.ndarray:
+    """[B] s, of whole steps."""
+    return np.asarray(horizons) + 0.5
+
+
 def chosen(found: macro.Rollouts, horizons: Sequence[int],
            price: tuple[float, float]) -> tuple[IntArray, np.ndarray]:
     """[B] the try that counts of each task, by `best_of.cheapest`, and whether it is in time."""
-    limit = np.asarray(horizons)[:, None]
-    solved = found.solved & (found.seconds <= limit + 0.5)
+    solved = found.solved & (found.seconds <= _within(horizons)[:, None])
     steps = np.where(found.solved, np.rint(found.seconds), FAR).astype(np.int64)
     best = cheapest(solved, steps, np.rint(found.effort).astype(np.int64), price)
     return best, np.take_along_axis(solved, best[:, None], axis=1)[:, 0]
@@ -92,11 +96,12 @@ class PointingPlanner(RoutePlanner):
 
     def rollouts(self, tasks: Sequence[Task],
                  tick: Callable[[int], object] = lambda episodes: None) -> macro.Rollouts:
-        """K tries of every task."""
+        """K tries of every task; with less of the preference where that takes too many steps."""
         problems = macro.stacked([problem_of(task) for task in tasks])
         return macro.rollouts(
             self.policy, problems, tries=self.decode.rollouts, heat=self.heat,
-            cooling=self.decode.cooling, seed=self.seed, preference=self.preference, tick=tick)
+            cooling=self.decode.cooling, seed=self.seed, preference=self.preference,
+            within=_within([task.horizon for task in tasks]), tick=tick)
 
     def warm(self, tasks: Sequence[Task]) -> None:
         """Compiles what `rollouts` of such tasks needs."""
