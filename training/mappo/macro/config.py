@@ -149,7 +149,7 @@ class MacroConfig:
 
 
 PAPER = Practice("3 robots, 5 to 7 targets", Draw())
-CREW = Draw(agents=(6, 12), targets=(8, 20), num_skills=1, metric="straight", numbers=5,
+CREW = Draw(agents=(6, 12), targets=(9, 20), num_skills=1, metric="straight", numbers=5,
             service=1.9, homes=1.0, crews=(1, 1), limit=8000.0)
 """Robots that start together and are needed several at once, as in others' instances."""
 HYPER = Hyper(loose=0.2)
@@ -196,7 +196,7 @@ PRESETS = {
               for one in ANY_TEAM.families[6:]))),
     "crews": MacroConfig(
         "crews", (
-            Practice("6 to 12 robots of one kind, 8 to 20 targets for up to 5", CREW,
+            Practice("6 to 12 robots of one kind, 9 to 20 targets for up to 5", CREW,
                      shrink=4, advantages="tries"),
             Practice("20 robots of one kind, 50 targets for up to 5",
                      replace(CREW, agents=(10, 20), targets=(20, 50)), shrink=32,
