@@ -38,7 +38,7 @@ _PAIRS = 1 << 15  # token pairs of the pool, which is what the attention of the 
 FEW = 8.0
 """Targets up to which all tries of a problem are as hot as asked for."""
 _CHUNK = 4096  # episodes of a call, more only if one problem's tries are
-_LESS = 0.25  # of the preference, where what it asks for comes too late
+_LESS = 0.125  # of the preference, where what it asks for comes too late
 _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": "NS",
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
          "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "",
@@ -146,7 +146,7 @@ def rollouts(policy: Policy, problems: MacroProblem, *, tries: int = 1, heat: fl
       preference: 0 time .. 1 effort.
       within: [B] or [], s in which a try has to solve everything. What saves way may come too
         late, and then saves nothing: a problem no try of which is in time is played again with
-        less of the preference, by quarters, at last for time alone.
+        less of the preference, by eighths, at last for time alone.
       tick: told how many episodes have ended, now and then; not of those played again.
 
     Raises:
