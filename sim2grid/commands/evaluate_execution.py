@@ -199,8 +199,13 @@ def _check(args: Args) -> None:
         ("width", 1, 4096), ("threads", 0, 1024),
         ("new_targets", 0, 64), ("impassable", 0, 64), ("cell", 0.25, 10), ("lose", 0, 1),
         ("slow", 0, 1), ("silent", 0, 1)), choices=("site", "loop", "mode", "planner", "backend"))
+    by_clock = {*args.mode} == {"clock"} and {*args.loop} == {"closed"}
+    for option, given in (("--search", args.search), ("--futures", args.futures)):
+        if given and not by_clock:
+            raise InputError(option, "is for missions by the clock that unfold; --mode clock "
+                             "--loop closed alone executes them")
     if args.unfold is not None:
-        if {*args.mode} != {"clock"} or {*args.loop} != {"closed"}:
+        if not by_clock:
             raise InputError("--unfold", "its missions are by the clock; --mode clock --loop "
                              "closed alone executes them")
         for name in ("lose", "slow", "silent", "new_targets", "impassable"):

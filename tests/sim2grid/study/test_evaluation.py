@@ -247,6 +247,8 @@ CLOCKED = "tests/evaluation/nearest.py"
     (["--mission", "outpots"], "outpots: no such file; did you mean outpost"),
     (["--mission", "demo", "sampling"], "sampling: clock: is by the clock, which --mode clock"),
     (["--unfold", "hidden"], "--unfold: its missions are by the clock; --mode clock"),
+    (["--search", "middle"], "--search: is for missions by the clock that unfold; --mode clock"),
+    (["--futures", "16", "--mode", "clock", "barrier"], "--futures: is for missions by the clock"),
     (["--unfold", "hidden", "--mode", "clock", "--lose", "1"], "--lose: comes at decisions"),
     (["--unfold", "hidden", "--mode", "clock", "--search", "middle", "--count", "1"],
      "--search middle: has no effect where targets are hidden"),
