@@ -22,6 +22,7 @@ from moonteam.terrain import soil as soils
 from sim2grid.frame import Frame, tilt
 from sim2grid.loop.record import Leg, Record
 from sim2grid.measure.slip import expected, slip
+from sim2grid.measure.ways import WayReport, ways_driven
 
 Floats = npt.NDArray[np.float64]
 
@@ -129,6 +130,7 @@ class RobotReport(msgspec.Struct, frozen=True):
     driving_s: float | None = None  # by the clock: on its ways,
     slower_s: float | None = None  # of which so much more than the ground says,
     service_s: float | None = None  # and in services
+    ways: tuple[WayReport, ...] | msgspec.UnsetType = msgspec.UNSET  # not in the file without any
     battery: BatteryReport | msgspec.UnsetType = msgspec.UNSET  # not in the file without one
     soil: SoilReport | msgspec.UnsetType = msgspec.UNSET  # nor on rigid ground
 
@@ -244,6 +246,8 @@ def robot_report(mission: Mission, robot: int, track: Track, record: Record,
         distance_m=_round(float(np.hypot(*np.diff(track.xyz[:, :2], axis=0).T).sum())),
         energy_j=_round(float((track.power[1:] * steps).sum())),
         propellant_kg=_round(float((track.propellant_rate[1:] * steps).sum()), 6),
+        ways=(() if kind is None else ways_driven(record, robot, kind.settle, height))
+        or msgspec.UNSET,
         battery=battery_report(record, robot), soil=soil_report(mission, kind, track, height),
         **time_spent(record, robot))
 

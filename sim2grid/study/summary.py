@@ -9,6 +9,7 @@ The document is `report.json` of `moonteam evaluate execution`:
 - `comparisons`: async over barrier, one engine over the other, and by the clock each contender over
   the first, on missions that both solved.
 - `differences`: missions that went otherwise on another engine, and what differed.
+- `ways`: by the clock, how long ways took over what was reckoned, by kind and steepness.
 - `failures`: for each site and contender, cause -> mission numbers.
 - `missions`: number, draws and the whole mission as in its file.
 - `rows`: a row for each mission and contender; `report` is that of `moonteam rollout`.
@@ -31,6 +32,7 @@ from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import Report, RobotReport
 from sim2grid.study.evaluation import Contender, Entry, Row
 from sim2grid.study.fleet import GIVEN
+from sim2grid.study.scatter import scatter
 
 ALL = "all"
 """What stands for all sites together."""
@@ -58,6 +60,7 @@ def document(rows: Sequence[Row], entries: Sequence[Entry], contenders: Sequence
                     for key, group in used.items()],
         "comparisons": [line | many for line in compare(used, by_name, seed)],
         "differences": differences(used, by_name),
+        "ways": scatter([row.report for row in rows if row.contender in by_name]),
         "failures": [heads[key] | {"causes": failures(group)} for key, group in used.items()],
         "notes": notes(options),
         "missions": [msgspec.to_builtins(entry) for entry in entries],
@@ -285,6 +288,11 @@ ON_SOIL = ["site", "planner", "slip of wheels", "expected", "energy of a robot, 
 """On regolith: of robots on the ground; expected: by `moonteam evaluate paces`, from the slopes of
 the ways that they took.
 """
+WAYS = ["kind", "steepness", "ways", "took / reckoned", "spread"]
+"""Ways driven to their ends, of all contenders. Steepness: mean of the ground's slope along them.
+Took / reckoned: the median; reckoned: by the travel field, and what setting out and coming to rest
+cost the kind. Spread: standard deviation of its logarithm; of all kinds, about the medians above.
+"""
 MISSIONS = ["mission", "contender", "came to", "s", "s at best, as planned", "decisions"]
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
             "seconds, ratio", "seconds more", "moves, ratio"]
@@ -301,6 +309,11 @@ def where(line: dict[str, Any]) -> str:
     first = line["site_seed"]
     last = first + line.get("sites", 1) - 1
     return f"{line['site']} {first}" + (f" to {last}" if last > first else "")
+
+
+def _steepness(line: dict[str, Any]) -> str:
+    low, high = line["from_deg"], line["to_deg"]
+    return "any" if low is None else f"over {low:g}°" if high is None else f"{low:g} to {high:g}°"
 
 
 def tables(report: dict[str, Any]) -> list[Plain]:
@@ -339,6 +352,10 @@ def tables(report: dict[str, Any]) -> list[Plain]:
             spread(line, "service_s", 1),
             _value(line["seconds"] - line["driving_s"] - line["service_s"], 1),
             _value(line["replans"], 2)] for line in spent]))
+    if report["ways"]:
+        found.append((WAYS, [[
+            line["kind"], _steepness(line), str(line["ways"]), _value(line["ratio"], 3),
+            _value(line["spread"], 3)] for line in report["ways"]]))
     if soft := [line for line in report["summary"] if line.get("expected_energy_j") is not None]:
         found.append((ON_SOIL, [[
             where(line), line["planner"], *(spread(line, key, 2) for key in ON_SOIL_KEYS[:2]),
