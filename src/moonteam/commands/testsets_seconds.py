@@ -6,11 +6,14 @@ import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
 from moonteam.problem.timed import Agent, Known, Target, Timed
+
+if TYPE_CHECKING:
+    from moonteam.planners.seconds.base import Moment
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -53,12 +56,14 @@ def draws(recipe: Recipe, seed: int, speeds: tuple[float, ...]) -> Iterator[Time
             Target((float(t.at[0]), float(t.at[1])), t.skills, t.type) for t in found.targets))
 
 
-def certify(problem: Timed) -> Known | None:
-    """The least makespan by the exact planner; None if it is not proved."""
+def certify(problem: Timed, known: Callable[[Timed], Moment] | None = None) -> Known | None:
+    """The least makespan by the exact planner, of what is expected or else `known`; None if it is
+    not proved.
+    """
     from moonteam.planners.seconds.base import MS, moment
     from moonteam.planners.seconds.exact import ExactPlanner
 
-    plan = ExactPlanner("makespan").plan(moment(problem))
+    plan = ExactPlanner("makespan").plan((known or moment)(problem))
     if plan.status != "optimal" or plan.makespan is None:
         return None
     return Known(makespan=plan.makespan / MS)

@@ -9,6 +9,7 @@ import pytest
 from moonteam import loading, paths
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
+from moonteam.planners.unfolding import draw
 from moonteam.planners.unfolding.deciders import Decider, OverFutures, Replanning
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.search import Middle, NearestUnseen, Sweep
@@ -16,7 +17,7 @@ from moonteam.planners.unfolding.world import World
 from moonteam.problem import timed
 from moonteam.problem.timed import Agent, Loss, Prospect, Target, Timed
 
-SETS = ("following", "arrivals", "hidden", "losses")
+SETS = ("following", "arrivals", "hidden", "losses", "scatter")
 
 
 def missions(name, count):
@@ -87,6 +88,8 @@ def otherwise(one, name):
             appears=target.appears and target.appears + 1.0)
     if name == "losses":
         agents[0] = msgspec.structs.replace(agents[0], lost=17.0, pace=())
+    if name == "scatter":
+        agents = [msgspec.structs.replace(a, pace=a.pace[::-1]) for a in agents]
     other = msgspec.structs.replace(one, targets=tuple(targets), agents=tuple(agents))
     return timed.check(other, "other")
 
@@ -95,7 +98,32 @@ def first_news(world, told):
     """ms at which something that was not known from the start came to be known."""
     news = [at for at in world.state.known_at if at > 0]
     lost = [int(1000 * at) for at in world._lost if at is not None]
-    return min([*news, *lost, told[-1][0] + 1])
+    came = [told[1][0]] if world.state.problem.expects.scatter else []  # the first who arrives
+    return min([*news, *lost, *came, told[-1][0] + 1])
+
+
+def test_a_way_takes_what_it_takes_and_that_is_known_when_it_ends():
+    problem = mission(
+        [Agent((0.0, 0.0), ("A",), 2.0, pace=(1.5, 0.5))],
+        [Target((10.0, 0.0), ("A",), service=1.0), Target((10.0, 8.0), ("A",))],
+        expects=Prospect(scatter=0.3))
+    world, told = played(problem, Replanning(ExactPlanner()))
+    assert world.outcome.solves == [8.5, 10.5]  # 5 s times 1.5, a service, 4 s times 0.5
+    assert [now for now, _ in told] == [0, 7500, 8500]
+    other = World(problem)
+    other.step([0])
+    assert other.view().moment.free.tolist() == [0]
+    now = draw.in_hindsight(problem)
+    assert now.start.tolist() == [[7500, round(500 * np.hypot(10, 8) / 2)]]
+    assert now.between[0].tolist() == [[0, 2000], [6000, 0]]
+    assert ExactPlanner().plan(now).makespan == 10500
+
+
+def test_our_own_ways_scatter_as_the_set_says():
+    found = missions("scatter", 200)
+    logs = np.log([agent.pace for one in found for agent in one.agents])
+    assert np.std(logs) == pytest.approx(draw.SCATTER, rel=0.05)
+    assert all(one.expects == Prospect(scatter=draw.SCATTER) for one in found)
 
 
 def test_a_hidden_target_is_found_where_the_sensor_reaches_it_and_no_earlier():
