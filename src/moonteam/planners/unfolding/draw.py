@@ -3,8 +3,8 @@
 following: the paper's 5 + 5: each of the first five targets that is solved makes way for another;
 one cell a second, along x and y. arrivals: three targets known from the start, five more by a
 clock. hidden: five targets to be found by three robots of unlike speed that see 6 m. losses: teams
-of four robots, three skills and eight targets, and in one mission of three a robot is lost. scatter:
-eight targets known from the start, whose ways take more or less than expected.
+of four robots, three skills and eight targets, and in one mission of three a robot is lost.
+scatter: eight targets known from the start, whose ways take more or less than expected.
 """
 
 from __future__ import annotations
