@@ -94,7 +94,7 @@ def look(state: MacroState, preference: Array) -> Outlook:
     arrive = jnp.max(jnp.where(goal, state.busy[:, None], 0.0), axis=0)  # [M]
     loose = p.agent_mask & ~(bound & incomplete[here])
     come = jnp.where(loose[:, None], state.busy[:, None] + legs, FAR)  # [N, M]
-    soonest = jnp.min(jnp.where(p.has[:, None] & (lacks[None] > 0), come[:, :, None], FAR), axis=0)
+    soonest = together(jnp.where(p.has[:, None], come[:, :, None], FAR), lacks, FAR)
     soonest = jnp.where(lacks > 0, soonest, 0.0)  # [M, S]
     soonest = jnp.where(p.either, jnp.min(jnp.where(lacks > 0, soonest, FAR), axis=1),
                         jnp.max(soonest, axis=1))
@@ -130,6 +130,14 @@ def look(state: MacroState, preference: Array) -> Outlook:
         preference=preference, ahead=_ahead(state))
 
 
+def together(times: Array, count: Array, never: float) -> Array:
+    """[..., M, S] when `count` [..., M, S] of the agents are there, at `times` [..., N, M, S]; the
+    first of them where the count is 0, `never` where they are too few.
+    """
+    there = jnp.sum(times[..., None, :, :, :] <= times[..., :, None, :, :], axis=-3)
+    return jnp.min(jnp.where(there >= count[..., None, :, :], times, never), axis=-3)
+
+
 def _ahead(state: MacroState) -> Array:
     """[E, 3] what of the future concerns each token; all 0 where nothing more comes."""
     p = state.problem
@@ -154,9 +162,8 @@ def _token_features(view: Outlook) -> tuple[Array, Array]:
     reach = jnp.where(can, view.travel, LONG)
     near = jnp.min(reach, axis=-2)  # [B, M]
     second = jnp.min(jnp.where(reach > near[..., None, :], reach, LONG), axis=-2)
-    each = jnp.min(jnp.where((view.has[..., :, None, :] & (view.travel < LONG)[..., None])
-                             & view.agents[..., :, None, None], view.travel[..., None], LONG),
-                   axis=-3)  # [B, M, S]
+    each = together(jnp.where(view.has[..., :, None, :] & view.agents[..., :, None, None],
+                              view.travel[..., None], LONG), view.lacks, LONG)  # [B, M, S]
     meet = jnp.max(jnp.where(view.lacks > 0, each, 0.0), axis=-1)
     meet = jnp.where(view.either, near, meet) * view.targets
     moment = jnp.stack([

@@ -201,7 +201,9 @@ def _ends(now: Moment, lacks: Ints, ready: Floats) -> Floats:
     arrive = np.where(aim, now.busy[:, None], none).max(0)
     loose = now.team & ~(bound & incomplete[here])
     come = np.where(loose[:, None], now.busy[:, None] + now.ways, FAR)  # [N, M]
-    soonest = np.where(now.has[:, None] & wanted[None], come[:, :, None], FAR).min(0)  # [M, S]
+    times = np.where(now.has[:, None], come[:, :, None], FAR)  # [N, M, S]
+    there = (times[None] <= times[:, None]).sum(1)
+    soonest = np.where(there >= lacks, times, FAR).min(0)  # [M, S], when so many are there
     any_, all_ = np.where(wanted, soonest, FAR).min(1), np.where(wanted, soonest, none).max(1)
     soonest = np.where(now.either, any_, all_)
     soonest = np.where(incomplete & (soonest < FAR), soonest, none)

@@ -68,7 +68,10 @@ def _tokens(g: Graph) -> tuple[str, str]:
     near = g.least(reach, 1)
     second = g.least(g("Where", g("Greater", reach, g.wide(near, 1)), reach, long), 1)
     brings = g.both(g.wide("has", 2), g.wide(arrives, 3))  # [B, N, M, S]
-    each = g.least(g("Where", brings, g.wide("travel", 3), long), 1)
+    times = g("Where", brings, g.wide("travel", 3), long)
+    there = g.total(g.number(g("LessOrEqual", g.wide(times, 1), g.wide(times, 2))), 2)
+    enough = g("GreaterOrEqual", there, g.wide(wanted, 1))
+    each = g.least(g("Where", enough, times, long), 1)  # [B, M, S], when so many are there
     meet = g("Where", "either", near, g.most(g("Where", lacking, each, zero), 2))
     meet = g("Mul", meet, still)
     aim, after = g.number("goal"), g.number("after")
