@@ -198,14 +198,14 @@ PRESETS = {
         "crews", (
             Practice("6 to 12 robots of one kind, 9 to 20 targets for up to 5", CREW,
                      shrink=4, advantages="tries"),
-            Practice("20 robots of one kind, 50 targets for up to 5",
+            Practice("10 to 20 robots of one kind, 20 to 50 targets for up to 5",
                      replace(CREW, agents=(10, 20), targets=(20, 50)), shrink=32,
                      advantages="tries"),
             Practice("9 to 15 robots of 3 to 5 kinds, 10 to 20 targets",
                      replace(CREW, agents=(9, 15), targets=(10, 20), crews=(3, 5), num_skills=5,
                              numbers=1), shrink=8, advantages="tries"),
         ),
-        rounds=300, hyper=replace(HYPER, vf_coef=0.05), spec=PointerSpec(layers=5), lr=3e-4,
+        rounds=60, hyper=replace(HYPER, vf_coef=0.05), spec=PointerSpec(layers=5), lr=3e-4,
         chunk_rounds=2, eval_every=5, eval_scenarios=128),
     "unfolding": MacroConfig(
         "unfolding", (
