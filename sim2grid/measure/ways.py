@@ -37,16 +37,14 @@ def ways_driven(record: Record, robot: int, settle: float, height: Height | None
             if leg.action == SETTING_OUT:
                 ways.append([])
             ways[-1].append(leg)
-    return tuple(_reported(pieces, settle, height) for pieces in ways
-                 if all(leg.ended == "arrived" for leg in pieces)
-                 and sum(leg.expected_s or 0.0 for leg in pieces) > 0.0)
-
-
-def _reported(pieces: list[Leg], settle: float, height: Height | None) -> WayReport:
-    took = sum((leg.end_s or leg.start_s) - leg.start_s for leg in pieces)
-    expected = settle + sum(leg.expected_s or 0.0 for leg in pieces)
-    return WayReport(round(expected, 4), round(took, 4),
-                     None if height is None else _steepness(pieces, height))
+    found = []
+    for pieces in ways:
+        expected = sum(leg.expected_s or 0.0 for leg in pieces)
+        if expected > 0.0 and all(leg.ended == "arrived" for leg in pieces):
+            took = sum((leg.end_s or leg.start_s) - leg.start_s for leg in pieces)
+            found.append(WayReport(round(settle + expected, 4), round(took, 4),
+                                   None if height is None else _steepness(pieces, height)))
+    return tuple(found)
 
 
 def _steepness(pieces: list[Leg], height: Height) -> float | None:

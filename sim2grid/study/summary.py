@@ -30,9 +30,9 @@ from moonteam.report.intervals import Bootstrap, Figure, share
 from moonteam.report.tables import Plain
 from sim2grid.loop.fused.whole import LACKS
 from sim2grid.measure.metrics import Report, RobotReport
+from sim2grid.measure.scatter import scatter
 from sim2grid.study.evaluation import Contender, Entry, Row
 from sim2grid.study.fleet import GIVEN
-from sim2grid.study.scatter import scatter
 
 ALL = "all"
 """What stands for all sites together."""

@@ -5,8 +5,8 @@ import pytest
 
 from sim2grid.loop.record import GOING_ON, SETTING_OUT, Leg, Record
 from sim2grid.measure.metrics import Report, RobotReport
+from sim2grid.measure.scatter import scatter
 from sim2grid.measure.ways import WayReport, ways_driven
-from sim2grid.study.scatter import scatter
 
 
 def leg(action, a, b, begin, end, expected, ended="arrived", robot=0):
