@@ -112,7 +112,7 @@ def test_rows_for_objectives_and_limits_and_what_is_refused(problems):
 
 
 def test_the_registry_says_what_is_no_planner():
-    assert registry.names()[:5] == ("exact", "greedy", "lns", "cpsat", "exhaustive")
+    assert registry.names()[:5] == ("exact", "greedy", "lns", "cpsat", "routing")
     kind = registry.find(f"{FILE}:Quitter")
     assert (kind.name, kind.most_targets, kind.anytime) == ("Quitter", 8, True)
     assert kind.make(PlannerOptions(objective="moves")).objective == "effort"

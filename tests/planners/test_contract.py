@@ -25,7 +25,7 @@ def nearest(request):
     *((name, "argmax") for name in registry.names()), ("policy", "sample"),
     ("policy", "best-of-8"), ("nearest", "argmax")])
 def test_it_keeps_the_contract(name, decode, nearest):
-    if name == "cpsat" and find_spec("ortools") is None:
+    if name in ("cpsat", "routing") and find_spec("ortools") is None:
         pytest.skip("the extra ortools is not installed")
     results = contract.check(nearest if name == "nearest" else name,
                              PlannerOptions(decode=decode))

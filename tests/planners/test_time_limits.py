@@ -32,7 +32,7 @@ def scenario(size):
 
 def spent(clock, name, found, limit):
     """(CPU s, wall s) of one plan, and its status."""
-    if name == "cpsat":
+    if name in ("cpsat", "routing"):
         pytest.importorskip("ortools")
     def make(limit):
         options = PlannerOptions(time_limit=limit)
@@ -58,6 +58,11 @@ def check(clock, name, found, limit):
             break
     assert cpu < allowed
     assert wall < allowed + LOADED
+
+
+def test_routing_in_a_second():
+    for clock in PLANNERS:
+        check(clock, "routing", scenario("8x40"), 1.0)
 
 
 CASES = [(clock, name, size) for clock, names in PLANNERS.items() for name in names

@@ -36,7 +36,7 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
 
     Of a set by the clock (its objects say "clock": "seconds"), makespan and effort are in its
     own unit of time, and planners are those by the clock: auto, exact, greedy, lns, cpsat,
-    exhaustive, and policy with a network that points at targets.
+    routing, exhaustive, and policy with a network that points at targets.
 
     Files in --out: report.json, summary.csv, rows.csv, table.md and gaps.png; and rows.jsonl, to
     which each plan is added as it is made (a policy's batch as a whole), so that --resume goes on.
@@ -55,8 +55,8 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     """Scenario set (.jsonl), scenario (.json), or the name of a bundled set; without it,
     --count scenarios are drawn from --seed."""
     planner: Many[tuple[str, ...]] = ()
-    """auto, exact, greedy, lns, exhaustive, cpsat, policy, another package's, or FILE.py:OBJECT;
-    again for more rows. Default: exact."""
+    """auto, exact, greedy, lns, exhaustive, cpsat, routing, policy, another package's, or
+    FILE.py:OBJECT; again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves (by the clock: effort) or weighted; again for more rows. Default: makespan,
     and for best-of-K what the preference asks for."""
@@ -76,7 +76,7 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     beta: float = 0.05
     """Weight of the moves in the objective weighted."""
     time_limit: Many[tuple[float, ...]] = ()
-    """Seconds a scenario that anytime planners (exact, lns, cpsat) may take; again for
+    """Seconds a scenario that anytime planners (exact, lns, cpsat, routing) may take; again for
     more rows. Default: theirs."""
     threads: int = 1
     """That lns and auto search with side by side."""

@@ -54,7 +54,7 @@ class Args(Drawn, Limited, Resumable, Reported):
     new: int = 5
     """How many of a scenario's targets appear later; without SET, that many more than --targets."""
     time_limit: Many[tuple[float, ...]] = ()
-    """Seconds a plan that anytime planners (exact, lns, cpsat) may take; again for
+    """Seconds a plan that anytime planners (exact, lns, cpsat, routing) may take; again for
     more rows. Default: theirs."""
 
 

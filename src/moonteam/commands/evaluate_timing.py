@@ -35,7 +35,8 @@ class Args(Seeded, Reported):
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves or weighted; again for more. Default: all of exact's, else makespan."""
     time_limit: float | None = None
-    """Seconds a plan that anytime planners (exact, lns, cpsat) may take. Default: theirs."""
+    """Seconds a plan that anytime planners (exact, lns, cpsat, routing) may take. Default:
+    theirs."""
     policy: str | None = None
     """Policy file or bundled policy. A recurrent network is rebuilt, untrained, for each number
     of targets; without a file it is the paper's."""

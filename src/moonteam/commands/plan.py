@@ -52,8 +52,8 @@ class Args(Planning, Saved, Printed):
     planner: str = "exact"
     """auto (exact if that is certified in half of the time, else local search; it says which and
     why), exact (proves its plan the best; up to 12 targets), greedy, lns (large-neighbourhood
-    search), cpsat (needs the extra ortools), exhaustive (up to 6 targets), policy, another
-    package's, or FILE.py:OBJECT."""
+    search), cpsat and routing (need the extra ortools), exhaustive (up to 6 targets), policy,
+    another package's, or FILE.py:OBJECT."""
     seed: int = 0
     """Seed of lns and of a policy that samples."""
     threads: int = 1

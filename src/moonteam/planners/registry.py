@@ -25,8 +25,8 @@ _HERE = "moonteam.planners"
 _REGISTRY: Registry[object] = Registry("planner", _HERE, object, {
     "exact": f"{_HERE}.exact:PLANNER", "greedy": f"{_HERE}.greedy:PLANNER",
     "lns": f"{_HERE}.lns:PLANNER", "cpsat": f"{_HERE}.cpsat:PLANNER",
-    "exhaustive": f"{_HERE}.exhaustive:PLANNER", "policy": f"{_HERE}.policy:PLANNER",
-    "auto": f"{_HERE}.auto:PLANNER"})
+    "routing": f"{_HERE}.routing:PLANNER", "exhaustive": f"{_HERE}.exhaustive:PLANNER",
+    "policy": f"{_HERE}.policy:PLANNER", "auto": f"{_HERE}.auto:PLANNER"})
 
 
 def names() -> tuple[str, ...]:

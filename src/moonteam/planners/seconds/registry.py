@@ -25,6 +25,7 @@ _HERE = "moonteam.planners.seconds"
 _REGISTRY: Registry[object] = Registry("planner by the clock", _HERE, object, {
     "exact": f"{_HERE}.exact:ExactPlanner", "greedy": f"{_HERE}.greedy:GreedyPlanner",
     "lns": f"{_HERE}.local:LocalSearchPlanner", "cpsat": f"{_HERE}.cpsat:CpSatPlanner",
+    "routing": f"{_HERE}.routing:RoutingPlanner",
     "exhaustive": f"{_HERE}.exhaustive:ExhaustivePlanner",
     "policy": f"{_HERE}.policy:PolicyPlanner", "auto": f"{_HERE}.auto:AutoPlanner"})
 
