@@ -6,6 +6,7 @@ Legend: T decisions, E environments, I episodes, S moments, K options.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from moonteam.policies.pointer import Outlook
 
@@ -39,6 +40,8 @@ class Hyper:
     """Preferences drawn from time to effort; else always time."""
     loose: float = 0.0
     """Share of the moments at which those on their way choose again."""
+    optimiser: Literal["muon", "adam"] = "muon"
+    """What makes steps of gradients; muon leaves to Adam what is no matrix between features."""
     ema: float = 0.998
     """Decay of the running mean of the weights, which is what is kept."""
     part: int = 12_800
