@@ -11,9 +11,10 @@ from moonteam import loading, paths
 from moonteam.grid.macro import world as macro_world
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
+from moonteam.planners.seconds.keeper import choices, order_of
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.macro import problem_of
-from moonteam.planners.unfolding.ahead import LookingAhead, imagined, raced
+from moonteam.planners.unfolding.ahead import LookingAhead, imagined, planned, raced, sure
 from moonteam.planners.unfolding.deciders import Replanning, play, play_together
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.pointing import Pointing
@@ -88,10 +89,37 @@ def test_what_is_done_does_not_depend_on_who_plays_beside():
     assert choose([views[1], views[0], views[1]])[2].tolist() == together[1].tolist()
 
 
+def test_where_nothing_more_may_come_the_plan_of_what_is_known_is_done():
+    problem = missions("following", 1)[0]
+    view = later(problem, 9)
+    assert sure(view)
+    assert not sure(World(problem).view())
+    plan = planned(view.moment)
+    assert plan is not None
+    assert LookingAhead(POLICY, 2).choose([view])[0].tolist() == plan.tolist()
+    exact = ExactPlanner().plan(view.moment)
+    assert plan.tolist() == choices(view.moment, order_of(exact)).tolist()
+    assert planned(replace(view.moment, limit=1)) is None
+
+
+@pytest.mark.parametrize(("goal", "place"), [("makespan", 0), ("waiting", 1)])
+def test_the_plan_stands_among_what_is_tried_and_is_the_usual_where_it_is_for_what_counts(
+        goal, place):
+    view = later(missions("following", 3)[1], 1)
+    plan = np.flatnonzero(~view.moment.solved)[[1, 2, 0]]
+    (asked,) = LookingAhead(POLICY, 2, goal)._ask([view], 1, [plan])
+    count = len(asked.open_)
+    wanted = [int(np.flatnonzero(asked.open_ == j)[0]) if free == 0 and held < 0 else tried
+              for j, free, held, tried in zip(plan, view.moment.free, asked.bound,
+                                              asked.tries[0], strict=True)]
+    assert [min(int(j), count) for j in asked.tries[place]] == wanted
+    assert len(np.unique(asked.tries, axis=0)) == len(asked.tries)
+
+
 def test_nobody_waits_for_a_place_to_look_from():
     view = with_looks(World(missions("hidden", 1)[0]).view())
     ahead = LookingAhead(POLICY, 2, "waiting")
-    (asked,) = ahead._ask([view], 1)
+    (asked,) = ahead._ask([view], 1, [None])
     first = len(view.targets) + len(view.looks)
     served = np.zeros((1, 24))
     served[0, :len(view.targets)], served[0, len(view.targets):first] = 3.0, 1000.0

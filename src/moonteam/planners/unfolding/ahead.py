@@ -1,9 +1,10 @@
-"""A policy that looks ahead: it plays what it would do, and what else it could, in many futures.
+"""A policy that looks ahead: it plays what a plan says, and what else it could do, in many futures.
 
 Where targets follow on others, arrive by a clock or are hidden, or a robot may be lost, what is to
 come can be drawn, and the policy can go on in each of these futures by its likeliest choices to the
 end, thousands of them in one call of the macro world. That is one step of policy iteration, at the
-moment itself.
+moment itself. What is tried there is the plan of what is known, and what the policy draws; where
+nothing more may come to pass, the plan is all that is needed.
 
 Legend: B missions, K tries of a mission, F futures, R rollouts of a call, N robots, T targets, the
 open and then the coming ones, padded.
@@ -27,8 +28,11 @@ from moonteam.grid.macro import world
 from moonteam.grid.macro.draw import places
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.planners import macro
-from moonteam.planners.seconds.base import MS
-from moonteam.planners.seconds.keeper import WAIT
+from moonteam.planners.seconds.base import MS, Moment
+from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.planners.seconds.keeper import WAIT, choices, order_of
+from moonteam.planners.seconds.local import LocalSearchPlanner
+from moonteam.planners.seconds.search.labels import MAX_AGENTS
 from moonteam.planners.unfolding.deciders import NOT_DONE, Goal
 from moonteam.planners.unfolding.future import Future, future, may_lose
 from moonteam.planners.unfolding.pointing import begun, moments, problem_in, said
@@ -40,7 +44,11 @@ from moonteam.policies.policy import Policy
 HEAT = 2.0
 """Temperature at which the other tries are drawn."""
 TRIES = 16
-"""K, joint choices drawn at a moment, the likeliest first; equal ones are one."""
+"""Joint choices drawn at a moment, the likeliest first; equal ones are one."""
+EXACTLY = 10
+"""Targets, places to look from counted, up to which the plan of what is known is exact."""
+MOVES = 300
+"""Of local search for each of more."""
 FIRST = 16
 """Futures in which all tries are played; then twice as many, and so on, with those still in it."""
 SURE = 2.0
@@ -60,17 +68,20 @@ class _Asked:
     view: View
     open_: np.ndarray  # targets that can still be gone for
     bound: np.ndarray  # [N] int32, place in `open_` of who waits there for others; -1: free
-    tries: np.ndarray  # [K, N] int32, places in `open_`; T and above: waits
+    tries: np.ndarray  # [K, N] int32, places in `open_`; T and above: waits; the usual one first
     rng: np.random.Generator
 
 
 class LookingAhead:
-    """The policy's choice unless another is better in the mean over futures.
+    """What is planned of what is known, unless something else is better in the mean over futures.
 
-    Joint choices are drawn from the policy and raced: all are played in a few futures that they
-    share, who is clearly behind the best drops out, and the others go on with as many futures
-    again. What gains most over the likeliest is done, if it gains more than its standard error.
-    Draws depend on the moment and the seed alone, not on what other missions are played beside it.
+    Where waiting counts, for which nobody plans, the policy's likeliest choice takes its place.
+
+    The plan's first moves and joint choices drawn from the policy are raced: all are played in a
+    few futures that they share, who is clearly behind the best drops out, and the others go on with
+    as many futures again. What gains most over the plan is done, if it gains more than its standard
+    error. Draws depend on the moment and the seed alone, not on what other missions are played
+    beside it; so do plans, which are exact or of a set number of moves.
 
     Args:
       policy: of kind pointer.
@@ -92,12 +103,22 @@ class LookingAhead:
         """[B] of [N] int64: a target's number or WAIT."""
         # Who plays side by side fills calls up with the first view.
         once = {id(view): view for view in views}
-        asked = self._ask(list(once.values()), len(views))
-        best = dict(zip(once, self._best(asked), strict=True))
+        plans = {key: planned(view.moment) for key, view in once.items()}
+        best = {key: plan for key, plan in plans.items()
+                if plan is not None and sure(once[key]) and self._goal == "makespan"}
+        rest = {key: view for key, view in once.items() if key not in best}
+        if rest:
+            asked = self._ask(list(rest.values()), len(views), [plans[key] for key in rest])
+            best |= dict(zip(rest, self._best(asked), strict=True))
         return [best[id(view)] for view in views]
 
-    def _ask(self, views: list[View], size: int) -> list[_Asked]:
-        """What the policy could do at each moment [B]; calls are filled up to `size`."""
+    def _ask(self, views: list[View], size: int,
+             plans: list[np.ndarray | None]) -> list[_Asked]:
+        """What could be done at each moment [B], its plan [N] too; calls are filled up to `size`.
+
+        First stands what is done unless another is better: the plan, which is for the makespan, or
+        what the policy finds likeliest.
+        """
         filled = views + views[:1] * (size - len(views))
         problems, bound = moments(filled)
         targets = problems.service.shape[1]
@@ -107,15 +128,20 @@ class LookingAhead:
         drawn = np.asarray(_drawn(self._spec, self._params, problems, bound, seeds,
                                   self._preference))
         found = []
-        for view, own, tries, rng in zip(views, bound, drawn, rngs, strict=False):
+        for view, own, tries, rng, plan in zip(views, bound, drawn, rngs, plans, strict=False):
             count = len(view.places)
             open_ = np.flatnonzero(~view.moment.solved)
             place = np.full(targets + 1, targets, np.int32)  # of padding and waiting: past the last
             place[open_] = np.arange(len(open_))
             held = own[:count]
-            different = np.unique(tries[:, :count], axis=0, return_index=True)[1]
+            tries = tries[:, :count]
+            if plan is not None:
+                free = (held < 0) & (view.moment.free == 0) & view.moment.present & (plan >= 0)
+                first = np.where(held >= 0, tries[0], np.where(free, plan, targets))
+                tries = np.insert(tries, 0 if self._goal == "makespan" else 1, first, axis=0)
+            different = np.unique(tries, axis=0, return_index=True)[1]
             found.append(_Asked(view, open_, np.where(held >= 0, place[held], -1).astype(np.int32),
-                                place[tries[np.sort(different), :count]], rng))
+                                place[tries[np.sort(different)]], rng))
         return found
 
     def _rng(self, view: View) -> np.random.Generator:
@@ -203,6 +229,20 @@ class LookingAhead:
         span, served = (np.concatenate(x)[:len(row)].astype(np.float64)
                         for x in zip(*jax.device_get(found), strict=True))
         return span, served
+
+
+def sure(view: View) -> bool:
+    """Whether nothing may come to pass that is not known."""
+    return not view.coming and not may_lose(view)
+
+
+def planned(moment: Moment) -> np.ndarray | None:
+    """[N] what a plan of all that is known has everybody do first; None where none is found."""
+    count, agents = int((~moment.solved).sum()), len(moment.present)
+    planner = ExactPlanner() if count <= EXACTLY and agents <= MAX_AGENTS else (
+        LocalSearchPlanner(iterations=MOVES * count))
+    plan = planner.plan(moment)
+    return None if plan.status == "infeasible" else choices(moment, order_of(plan))
 
 
 def raced(costs: np.ndarray, usual: bool) -> tuple[int, np.ndarray]:

@@ -1,5 +1,7 @@
 """What makes steps of gradients on macro-decisions."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,9 +37,8 @@ def test_muon_learns_all_directions_of_a_matrix_at_one_pace(params):
     rng = np.random.default_rng(0)
     steep = rng.normal(size=(16, 16)) @ np.diag(np.geomspace(1.0, 1e-2, 16))
     slope["query"]["kernel"] = jnp.asarray(steep, jnp.float32)
-    for name, wide in (("muon", True), ("adam", False)):
-        hyper = Hyper(optimiser=name)
+    for hyper, wide in ((Hyper(optimiser="muon"), True), (Hyper(optimiser="adam"), False)):
         state = Learner.begin(params, hyper).optimiser
-        way, _ = _optimiser(hyper).update(slope, state, params)
+        way: Any = _optimiser(hyper).update(slope, state, params)[0]
         sizes = np.linalg.svd(np.asarray(way["query"]["kernel"]), compute_uv=False)
         assert (sizes[-4] > 0.3 * sizes[0]) == wide
