@@ -15,7 +15,6 @@ from jax import Array
 
 from moonteam.policies.pointer import Outlook, Pointed, PointerSpec, point
 from training.mappo.macro.hyper import Hyper
-from training.mappo.macro.muon import between_features, muon
 
 AXIS = "batch"
 """Of the mesh, see `training.sharding`."""
@@ -37,11 +36,29 @@ class Learner(NamedTuple):
 
 
 def _optimiser(hyper: Hyper) -> optax.GradientTransformation:
-    """Behind a gradient-norm clip; the rate is given with each update."""
-    clip, adam = optax.clip_by_global_norm(hyper.max_grad_norm), optax.scale_by_adam(eps=1e-5)
+    """Behind a gradient-norm clip; the rate is given with each update.
+
+    Muon turns the momentum of a matrix between features into the nearest orthogonal one, so that
+    all directions are learned at one pace (Jordan et al. 2024); scaled to the root mean square of
+    Adam's steps, to whose rates it then keeps (Liu et al. 2025). All else is Adam's.
+    """
+    clip = optax.clip_by_global_norm(hyper.max_grad_norm)
     if hyper.optimiser == "adam":
-        return optax.chain(clip, adam)
-    return optax.chain(clip, optax.partition({"muon": muon(), "adam": adam}, between_features))
+        return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
+    return optax.chain(clip, optax.contrib.muon(
+        learning_rate=-1.0, consistent_rms=0.2, muon_weight_dimension_numbers=_between_features))
+
+
+def _between_features(params: Any) -> Any:
+    """Of parameters those that Muon turns: matrices, but for those that read inputs or write
+    numbers; else None.
+    """
+    def one(path: tuple[Any, ...], x: Array) -> optax.contrib.MuonDimensionNumbers | None:
+        layer = str(path[0].key)
+        inner = layer.startswith("block") or layer in ("query", "key", "pool")
+        return optax.contrib.MuonDimensionNumbers() if inner and x.ndim == 2 else None
+
+    return jax.tree_util.tree_map_with_path(one, params)
 
 
 def part_of(count: int, size: int) -> int:
@@ -89,7 +106,7 @@ def descend(learner: Learner, hyper: Hyper, loss: Callable[[Any, Any, Array], tu
 
         way, said = jax.tree.map(lambda x: jnp.sum(x, axis=0),
                                  jax.lax.map(slope, index.reshape(-1, size)))
-        way, state = rule.update(jax.lax.pmean(way, AXIS), learner.optimiser)
+        way, state = rule.update(jax.lax.pmean(way, AXIS), learner.optimiser, learner.params)
         params = jax.tree.map(lambda p, w: p - lr * w, learner.params, way)
         # Young, the mean must not remember how it began.
         steps = learner.steps.astype(jnp.float32)

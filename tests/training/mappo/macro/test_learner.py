@@ -9,9 +9,8 @@ import pytest
 
 from moonteam.policies import pointer
 from moonteam.policies.pointer import PointerSpec
-from training.mappo.macro import muon
 from training.mappo.macro.hyper import Hyper
-from training.mappo.macro.learner import Learner, _optimiser
+from training.mappo.macro.learner import Learner, _between_features, _optimiser
 
 SPEC = PointerSpec(width=16, heads=2, layers=1, pairs=8)
 MUON, ADAM = Hyper(optimiser="muon"), Hyper(optimiser="adam")
@@ -25,7 +24,7 @@ def params():
 @pytest.mark.parametrize("hyper", [MUON, ADAM])
 def test_a_step_goes_down_and_keeps_to_the_scale_of_adams(params, hyper):
     slope = jax.tree.map(lambda x: jax.random.normal(jax.random.key(x.size), x.shape), params)
-    way, _ = _optimiser(hyper).update(slope, Learner.begin(params, hyper).optimiser)
+    way, _ = _optimiser(hyper).update(slope, Learner.begin(params, hyper).optimiser, params)
     downhill = sum(float(jnp.vdot(w, g)) for w, g in zip(
         jax.tree.leaves(way), jax.tree.leaves(slope), strict=True))
     assert downhill > 0.0  # `descend` takes it off
@@ -40,27 +39,15 @@ def test_muon_learns_all_directions_of_a_matrix_at_one_pace(params):
     slope["query"]["kernel"] = jnp.asarray(steep, jnp.float32)
     for hyper, wide in ((MUON, True), (ADAM, False)):
         state = Learner.begin(params, hyper).optimiser
-        way: Any = _optimiser(hyper).update(slope, state)[0]
+        way: Any = _optimiser(hyper).update(slope, state, params)[0]
         sizes = np.linalg.svd(np.asarray(way["query"]["kernel"]), compute_uv=False)
         assert (sizes[-4] > 0.3 * sizes[0]) == wide
 
 
-@pytest.mark.parametrize("shape", [(8, 8), (6, 12), (12, 6)])
-def test_it_is_the_nearest_orthogonal_matrix_nearly(shape):
-    slope = np.random.default_rng(1).normal(size=shape)
-    low, _, high = np.linalg.svd(slope, full_matrices=False)
-    rule = muon.muon()
-    given = {"one": jnp.asarray(slope, jnp.float32), "other": jnp.ones((3, 5))}
-    way, _ = rule.update(given, rule.init(given))
-    nearest = muon.RMS * max(shape) ** 0.5 * (low @ high)
-    near = np.sum(np.asarray(way["one"]) * nearest) / np.sum(nearest**2)
-    assert near == pytest.approx(0.95, abs=0.25)  # the quintic stops at 0.7 to 1.2
-    off = np.asarray(way["one"]) - near * nearest
-    assert np.linalg.norm(off) < 0.35 * np.linalg.norm(nearest)
-
-
 def test_inputs_outputs_and_all_that_is_no_matrix_are_adams(params):
-    kinds = muon.between_features(params)
-    assert kinds["block0"]["qkv"]["kernel"] == kinds["query"]["kernel"] == "muon"
-    assert kinds["agent"]["kernel"] == kinds["value"]["kernel"] == "adam"
-    assert kinds["block0"]["out"]["bias"] == kinds["block0"]["LayerNorm_0"]["scale"] == "adam"
+    kinds = _between_features(params)
+    assert kinds["block0"]["qkv"]["kernel"] is not None
+    assert kinds["query"]["kernel"] is not None
+    for one in (kinds["agent"]["kernel"], kinds["value"]["kernel"], kinds["block0"]["out"]["bias"],
+                kinds["block0"]["LayerNorm_0"]["scale"]):
+        assert one is None
