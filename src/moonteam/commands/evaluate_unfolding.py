@@ -57,7 +57,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     for more rows. Default: exact."""
     futures: Many[tuple[int, ...]] = ()
     """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
-    themselves in the futures; where ways take what is expected, thousands of them in one call."""
+    themselves in the futures; where ways take what is expected, thousands of them in one call, and
+    what they try is then the plan of what is known beside their own choices."""
     foresee: Literal["all", "policies", "planners"] = "all"
     """Rows that are repeated over futures: all, those of policies, or those of other planners."""
     goal: Many[tuple[Goal, ...]] = ()

@@ -25,7 +25,7 @@ from moonteam.planners.seconds.search.goal import (
     schedule,
     weights,
 )
-from moonteam.planners.seconds.search.work import Work, compact
+from moonteam.planners.seconds.search.work import Work, compact, horizon
 
 _SCALE = 1000  # CP-SAT counts in integers: weights are rounded to thousandths
 _LOCAL = 0.25  # share of the time for the local search
@@ -117,11 +117,11 @@ class CpSatPlanner:
         """The model; None where the first circuit shows that there is no time to make it."""
         cp, model = self._cp, self._cp.CpModel()
         agents, count = work.start.shape
-        horizon = _horizon(work)
-        begin = [model.new_int_var(int(work.ready[t]), int(min(work.late[t], horizon)), "")
+        latest = horizon(work)
+        begin = [model.new_int_var(int(work.ready[t]), int(min(work.late[t], latest)), "")
                  if work.ready[t] <= work.late[t] else model.new_int_var(1, 0, "")
                  for t in range(count)]
-        span = model.new_int_var(int(work.floor), horizon, "")
+        span = model.new_int_var(int(work.floor), latest, "")
         visit = [[model.new_bool_var("") for _ in range(count)] for _ in range(agents)]
         built = Model(cp, model, begin, visit, {}, span)
         for t in range(count):
@@ -150,18 +150,6 @@ class CpSatPlanner:
             goal = goal + cp.LinearExpr.weighted_sum(terms, costs)
         model.minimize(goal)
         return built
-
-
-def _horizon(work: Work) -> int:
-    """ms by which any plan that wastes no time is done."""
-    legs = work.between[work.between < NEVER]
-    starts, homes = work.start[work.start < NEVER], work.home[work.home < NEVER]
-    idle = work.idle_way[work.idle_way < NEVER]
-    longest = max(int(x.max(initial=0)) for x in (legs, starts))
-    most = (int(work.service.sum()) + len(work.service) * longest
-            + int(work.free.max(initial=0)) + int(work.ready.max(initial=0))
-            + max(int(homes.max(initial=0)), int(idle.max(initial=0))) + work.floor)
-    return min(work.limit, most)
 
 
 def _circuit(built: Model, work: Work, a: int, until: float) -> list[tuple[int, Any]]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.planners.seconds import base
-from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, problems
+from moonteam.planners.seconds.base import Moment, TimedPlan, problems
 from moonteam.planners.seconds.search.goal import (
     Objective,
     answer,
@@ -27,7 +27,7 @@ from moonteam.planners.seconds.search.goal import (
     schedule,
     weights,
 )
-from moonteam.planners.seconds.search.work import Open, Work, compact
+from moonteam.planners.seconds.search.work import Open, Work, compact, horizon
 
 _MAKING = 0.5  # share of the time that making the model may take
 _SCALE = 1000  # the library counts in integers: weights are rounded to thousandths
@@ -131,7 +131,7 @@ class _Model:
         self._manager = self._lib.RoutingIndexManager(
             count + 2 * agents, agents, [count + a for a in range(agents)], ends)
         self._model = self._lib.RoutingModel(self._manager)
-        self._horizon = _horizon(work)
+        self._horizon = horizon(work)
         self.whole = self._ways(work, alpha, beta, until)
         if self.whole:
             self._rules(work)
@@ -207,7 +207,7 @@ class _Model:
         return order, [sorted(teams[t]) for t in order]
 
 
-def _matrices(work: Work, visits: Visits, agent: int, horizon: int
+def _matrices(work: Work, visits: Visits, agent: int, latest: int
               ) -> tuple[np.ndarray, np.ndarray]:
     """[., .] ms of way, and of service before setting out, between all nodes for one agent."""
     agents, count = len(work.free), len(visits.target)
@@ -224,17 +224,7 @@ def _matrices(work: Work, visits: Visits, agent: int, horizon: int
     way[:count, end] = work.home[agent, target]
     stay[:count, end] = work.service[target]
     way[begin, end] = work.idle_way[agent]
-    return np.minimum(way, horizon + 1), stay
-
-
-def _horizon(work: Work) -> int:
-    """ms by which a plan that wastes no time is done, and no more than there are."""
-    ways = [x[x < NEVER].max(initial=0) for x in (work.start, work.between, work.home,
-                                                  work.idle_way)]
-    most = (len(work.service) * int(ways[1]) + int(work.service.sum()) + int(ways[0])
-            + int(ways[2]) + int(ways[3]) + int(work.free.max(initial=0))
-            + int(work.ready.max(initial=0)) + work.floor)
-    return int(min(work.limit, most))
+    return np.minimum(way, latest + 1), stay
 
 
 @functools.cache

@@ -125,3 +125,15 @@ def places(work: Work) -> int:
     """Agents of the largest team that is chosen one by one."""
     wanted = np.where(work.either, 1, work.need.sum(1))
     return int(min(len(work.free), wanted.max(initial=1)))
+
+
+def horizon(work: Work) -> int:
+    """ms by which any plan that wastes no time is done."""
+    legs = work.between[work.between < NEVER]
+    starts, homes = work.start[work.start < NEVER], work.home[work.home < NEVER]
+    idle = work.idle_way[work.idle_way < NEVER]
+    longest = max(int(x.max(initial=0)) for x in (legs, starts))
+    most = (int(work.service.sum()) + len(work.service) * longest
+            + int(work.free.max(initial=0)) + int(work.ready.max(initial=0))
+            + max(int(homes.max(initial=0)), int(idle.max(initial=0))) + work.floor)
+    return min(work.limit, most)
