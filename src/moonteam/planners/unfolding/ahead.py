@@ -100,7 +100,7 @@ class LookingAhead:
         self._preference = np.float32(preference)
 
     def choose(self, views: Sequence[View]) -> list[np.ndarray]:
-        """[B] of [N] int64: a target's number or WAIT."""
+        """[B] of [N] int64: a target's number, WAIT, or of a plan HOME."""
         # Who plays side by side fills calls up with the first view.
         once = {id(view): view for view in views}
         plans = {key: planned(view.moment) for key, view in once.items()}
