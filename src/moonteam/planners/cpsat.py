@@ -9,7 +9,6 @@ Legend: N agents, M open targets.
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import math
 import time
@@ -19,7 +18,7 @@ import numpy as np
 
 from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
-from moonteam.planners.kind import PlannerKind, PlannerOptions
+from moonteam.planners.kind import PlannerKind, PlannerOptions, ortools
 from moonteam.planners.lns import Events, Weights, best_insertion, improve, measure
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search.task import Task, weights
@@ -32,14 +31,6 @@ Arc = tuple[int, int, int]
 _SCALE = 1000  # CP-SAT counts in integers: weights are rounded to thousandths
 _LOCAL = 0.3  # share of the time for the plan that it starts from
 _MAKING = 0.5  # share of what is left that making the model may take
-
-
-def _cp_model() -> Any:
-    try:
-        return importlib.import_module("ortools.sat.python.cp_model")
-    except ImportError:
-        raise InputError("--planner cpsat", "OR-Tools is not installed; "
-                         "pip install moonteam[ortools]") from None
 
 
 class CpSatPlanner(RoutePlanner):
@@ -60,7 +51,7 @@ class CpSatPlanner(RoutePlanner):
         super().__init__(objective, alpha, beta)
         self.time_limit = self.limit = 10.0 if time_limit is None else time_limit
         self.workers = workers
-        self._cp = _cp_model()
+        self._cp = ortools("sat.python.cp_model", self.name)
 
     @classmethod
     def _trial(cls) -> CpSatPlanner:

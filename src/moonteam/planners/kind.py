@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from moonteam.errors import InputError
 from moonteam.planners import decode as decoding
@@ -100,3 +101,12 @@ class PlannerKind:
     wants_policy: bool = False
     parallel: bool = False
     """Whether it searches with several threads side by side."""
+
+
+def ortools(module: str, planner: str) -> Any:
+    """A module of OR-Tools, which is an extra. Raises InputError, in `planner`'s name, without."""
+    try:
+        return importlib.import_module(f"ortools.{module}")
+    except ImportError:
+        raise InputError(f"--planner {planner}", "OR-Tools is not installed; "
+                         "pip install moonteam[ortools]") from None

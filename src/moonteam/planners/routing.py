@@ -33,11 +33,11 @@ class RoutingPlanner(RoutePlanner):
                  time_limit: float | None = 1.0):
         super().__init__(objective, alpha, beta)
         self.time_limit = self._limit = 1.0 if time_limit is None else time_limit
-        routing.check_installed()
+        routing.library()
 
     @classmethod
     def _trial(cls) -> RoutingPlanner:
-        return cls()
+        return cls(time_limit=routing.TRIAL_S)
 
     def _answer(self, task: Task, began: float) -> Answer:
         goal = (1.0, 0.0) if self.objective == "makespan" else weights(

@@ -14,7 +14,7 @@ from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.seconds.keeper import choices, order_of
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.macro import problem_of
-from moonteam.planners.unfolding.ahead import LookingAhead, imagined, planned, raced, sure
+from moonteam.planners.unfolding.ahead import LookingAhead, imagined, of_the_known, raced, sure
 from moonteam.planners.unfolding.deciders import Replanning, play, play_together
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.pointing import Pointing
@@ -94,12 +94,12 @@ def test_where_nothing_more_may_come_the_plan_of_what_is_known_is_done():
     view = later(problem, 9)
     assert sure(view)
     assert not sure(World(problem).view())
-    plan = planned(view.moment)
+    plan = of_the_known(view.moment)
     assert plan is not None
     assert LookingAhead(POLICY, 2).choose([view])[0].tolist() == plan.tolist()
     exact = ExactPlanner().plan(view.moment)
     assert plan.tolist() == choices(view.moment, order_of(exact)).tolist()
-    assert planned(replace(view.moment, limit=1)) is None
+    assert of_the_known(replace(view.moment, limit=1)) is None
 
 
 @pytest.mark.parametrize(("goal", "place"), [("makespan", 0), ("waiting", 1)])

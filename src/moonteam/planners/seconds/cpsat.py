@@ -8,13 +8,12 @@ Legend: N agents, M open targets.
 
 from __future__ import annotations
 
-import importlib
 import math
 import time
 from dataclasses import dataclass
 from typing import Any
 
-from moonteam.errors import InputError
+from moonteam.planners.kind import ortools
 from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, problems
 from moonteam.planners.seconds.local import Best, compiled, search
 from moonteam.planners.seconds.search.goal import (
@@ -62,11 +61,7 @@ class CpSatPlanner:
         self.objective: Objective = check(objective, alpha, beta)
         self.alpha, self.beta, self.workers = alpha, beta, workers
         self.time_limit = 10.0 if time_limit is None else time_limit
-        try:
-            self._cp = importlib.import_module("ortools.sat.python.cp_model")
-        except ImportError:
-            raise InputError("--planner cpsat", "OR-Tools is not installed; "
-                             "pip install moonteam[ortools]") from None
+        self._cp = ortools("sat.python.cp_model", self.name)
 
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit, with its bound."""

@@ -10,13 +10,13 @@ Legend: N agents, M open targets, V visits.
 from __future__ import annotations
 
 import functools
-import importlib
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from moonteam.errors import InputError
+from moonteam.planners.kind import ortools
 from moonteam.planners.seconds import base
 from moonteam.planners.seconds.base import Moment, TimedPlan, problems
 from moonteam.planners.seconds.search.goal import (
@@ -29,6 +29,8 @@ from moonteam.planners.seconds.search.goal import (
 )
 from moonteam.planners.seconds.search.work import Open, Work, compact, horizon
 
+TRIAL_S = 0.05
+"""s of a first search that is for loading alone: the library goes on till its time is up."""
 _MAKING = 0.5  # share of the time that making the model may take
 _SCALE = 1000  # the library counts in integers: weights are rounded to thousandths
 _WAY = 0.01  # what a ms of way weighs beside one of makespan, for insertion to go by
@@ -80,7 +82,7 @@ class RoutingPlanner:
         self.objective: Objective = check(objective, alpha, beta)
         self.alpha, self.beta = alpha, beta
         self.time_limit = 1.0 if time_limit is None else time_limit
-        check_installed()
+        library()
 
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit."""
@@ -98,13 +100,9 @@ class RoutingPlanner:
         return answer(self.name, self.objective, moment, services, None, False, began)
 
 
-def check_installed() -> None:
-    """Raises InputError without OR-Tools."""
-    try:
-        importlib.import_module("ortools.constraint_solver.pywrapcp")
-    except ImportError:
-        raise InputError("--planner routing", "OR-Tools is not installed; "
-                         "pip install moonteam[ortools]") from None
+def library() -> Any:
+    """OR-Tools' routing library. Raises InputError without it."""
+    return ortools("constraint_solver.pywrapcp", "routing")
 
 
 def routed(opened: Open, alpha: float, beta: float, until: float
@@ -124,7 +122,7 @@ class _Model:
     """Nodes are the visits, then every agent's start, then every agent's end."""
 
     def __init__(self, work: Work, visits: Visits, alpha: float, beta: float, until: float):
-        self._lib = importlib.import_module("ortools.constraint_solver.pywrapcp")
+        self._lib = library()
         self._visits = visits
         agents, count = len(work.free), len(visits.target)
         ends = [count + agents + a for a in range(agents)]
@@ -184,7 +182,7 @@ class _Model:
 
     def solved(self, until: float) -> tuple[list[int], list[list[int]]] | None:
         """See `routed`."""
-        words = importlib.import_module("ortools.constraint_solver.routing_enums_pb2")
+        words = ortools("constraint_solver.routing_enums_pb2", "routing")
         asked = self._lib.DefaultRoutingSearchParameters()
         asked.first_solution_strategy = (
             words.FirstSolutionStrategy.PARALLEL_CHEAPEST_INSERTION)
@@ -231,4 +229,4 @@ def _matrices(work: Work, visits: Visits, agent: int, latest: int
 def loaded() -> None:
     """Loads the library: once a process, which counts for no time limit."""
     opened = compact(base.moment(base.TRIAL))
-    routed(opened, 1.0, 0.0, time.perf_counter() + 1.0)
+    routed(opened, 1.0, 0.0, time.perf_counter() + TRIAL_S)

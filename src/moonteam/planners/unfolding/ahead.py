@@ -103,7 +103,7 @@ class LookingAhead:
         """[B] of [N] int64: a target's number, WAIT, or of a plan HOME."""
         # Who plays side by side fills calls up with the first view.
         once = {id(view): view for view in views}
-        plans = {key: planned(view.moment) for key, view in once.items()}
+        plans = {key: of_the_known(view.moment) for key, view in once.items()}
         best = {key: plan for key, plan in plans.items()
                 if plan is not None and sure(once[key]) and self._goal == "makespan"}
         rest = {key: view for key, view in once.items() if key not in best}
@@ -236,7 +236,7 @@ def sure(view: View) -> bool:
     return not view.coming and not may_lose(view)
 
 
-def planned(moment: Moment) -> np.ndarray | None:
+def of_the_known(moment: Moment) -> np.ndarray | None:
     """[N] what a plan of all that is known has everybody do first; None where none is found."""
     count, agents = int((~moment.solved).sum()), len(moment.present)
     planner = ExactPlanner() if count <= EXACTLY and agents <= MAX_AGENTS else (
