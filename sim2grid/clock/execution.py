@@ -250,6 +250,18 @@ class TimedExecution:
         self.errands[robot] = Errand.idle(self.known.xy[robot], self.book.time)
         self.ask()
 
+    def let_go(self, target: int) -> None:
+        """A target has lapsed, if nobody serves it; where it has a worth the mission goes on."""
+        meant = [i for i, errand in enumerate(self.errands) if errand.choice == target]
+        if self.solved[target] or any(self.errands[i].phase == "serving" for i in meant):
+            return
+        if self.task.targets[target].worth:
+            self._settle(target)
+            self.record.lapsed.append(target)
+            for i in meant:
+                self._choose(i, WAIT)
+        self.ask("lapsed")
+
     def again(self, robot: int) -> None:
         """Looks for the robot's way anew from where it is."""
         errand = self.errands[robot]
@@ -281,12 +293,12 @@ class TimedExecution:
         elif (~self.solved).any() or any(e.phase == "free" for e in self.errands):
             self.question = moment if self.unfolding is None else self.unfolding.view(
                 moment, self.asked.frame.on_map(self.known.xy), self.known.speeds, self.errands,
-                self.book.time, self._happenings.coming)
+                self.book.time, self._happenings.coming, self.record.lapsed)
 
     def _hopeless(self, moment: Moment) -> list[int]:
-        """Open targets that have lapsed, or that nobody left can serve."""
+        """Open targets that have lapsed, or that nobody left can serve, and that have to be."""
         found = []
-        for j in np.flatnonzero(~moment.solved).tolist():
+        for j in np.setdiff1d(np.flatnonzero(~moment.solved), moment.optional).tolist():
             able = np.flatnonzero(moment.present & (moment.start[:, j] < NEVER)).tolist()
             if moment.lapses[j] < 0 or not able or not enough(able, j, moment):
                 found.append(j)
@@ -482,9 +494,7 @@ class TimedExecution:
     def _solve(self, target: int, team: list[int]) -> None:
         """A service has ended: its target is solved, its robots are free."""
         known, book = self.known, self.book
-        solved = self.solved.copy()
-        solved[target] = True
-        known.snapshot = replace(known.snapshot, solved=solved)
+        self._settle(target)
         centre = self.task.place(self.task.targets[target].at)
         self.record.solves.append(Solve(
             target, book.decision, book.time, tuple(team),
@@ -492,6 +502,12 @@ class TimedExecution:
         for i in team:
             self.errands[i] = Errand.idle(known.xy[i], book.time)
         self.ask()
+
+    def _settle(self, target: int) -> None:
+        """From now on nobody has to serve it."""
+        solved = self.solved.copy()
+        solved[target] = True
+        self.known.snapshot = replace(self.known.snapshot, solved=solved)
 
     def _break(self, target: int) -> None:
         """A service is broken off: who is left waits there again."""

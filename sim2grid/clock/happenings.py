@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from moonteam.planners.seconds.base import Bools
-from moonteam.problem.mission import Event
+from moonteam.problem.mission import Event, Target
 from sim2grid.clock.roads import Floats
 from sim2grid.clock.task import Task
 from sim2grid.loop.asked import Asked
@@ -20,6 +20,9 @@ from sim2grid.loop.known import Known
 from sim2grid.loop.logbook import Logbook
 from sim2grid.loop.record import LossCause, ReplanCause
 from sim2grid.loop.rules import metres
+
+LATE_S = 0.01
+"""s after which a target that has lapsed is given up."""
 
 
 class UnderWay(Protocol):
@@ -37,6 +40,10 @@ class UnderWay(Protocol):
 
     def ask(self, cause: ReplanCause | None = None) -> None:
         """A decision is due."""
+        ...
+
+    def let_go(self, target: int) -> None:
+        """A target's window has closed."""
         ...
 
     def lose(self, robot: int, cause: LossCause) -> None:
@@ -64,9 +71,9 @@ class Happenings:
         self._hidden = [event for event in mission.events if event.on_sight]
         self._sensors = np.array([robot.sensor_m or -np.inf for robot in mission.robots])
         self._names = [robot.name for robot in mission.robots]
-        self._windows: list[tuple[float, str]] = []
-        for target in mission.targets:
-            self._watch(target.appears, target.lapses)
+        self._windows: list[tuple[float, ReplanCause, int]] = []
+        for j, target in enumerate(mission.targets):
+            self._watch(j, target)
         self.silent_until = np.zeros(len(mission.robots))  # [R] mission seconds
 
     @property
@@ -87,13 +94,17 @@ class Happenings:
         self._follow()
         self._find()
         while self._windows and self._windows[0][0] <= now + 1e-6:
-            self._its.ask("appeared" if self._windows.pop(0)[1] == "appears" else "lapsed")
+            _, cause, target = self._windows.pop(0)
+            if cause == "lapsed":
+                self._its.let_go(target)
+            else:
+                self._its.ask(cause)
 
-    def _watch(self, appears: float, lapses: float | None) -> None:
-        if appears > 0:
-            self._windows.append((appears, "appears"))
-        if lapses is not None:
-            self._windows.append((lapses + 0.01, "lapses"))
+    def _watch(self, number: int, target: Target) -> None:
+        if target.appears > 0:
+            self._windows.append((target.appears, "appeared", number))
+        if target.lapses is not None:
+            self._windows.append((target.lapses + LATE_S, "lapsed", number))
         self._windows.sort()
 
     def _follow(self) -> None:
@@ -123,7 +134,7 @@ class Happenings:
             its.book.record.target_names.append(its.task.names[-1])
             known = its.known
             known.snapshot = its.asked.with_targets(known.snapshot, [event.target])
-            self._watch(event.target.appears, event.target.lapses)
+            self._watch(len(its.task.targets) - 1, event.target)
             its.ask(cause)
         if event.slow is not None:
             robot = self._names.index(event.slow.robot)

@@ -74,9 +74,12 @@ class Unfolding:
                 self.ground.see(np.stack([before[i], after[i]]), reach)
 
     def view(self, moment: Moment, at: Floats, speeds: Floats, errands: Sequence[Errand],
-             now: float, coming: int) -> View:
-        """What is known at second `now`, with robots at `at` [R, 2] m as fast as `speeds` [R]."""
-        clock = round(MS * now)
+             now: float, coming: int, lapsed: Sequence[int] = ()) -> View:
+        """What is known at second `now`, with robots at `at` [R, 2] m as fast as `speeds` [R], and
+        targets that have `lapsed`, which counts as solved.
+        """
+        clock, served = round(MS * now), moment.solved.copy()
+        served[list(lapsed)] = False
         problem = self._problem(at, speeds)
         targets = [self._target(j, target) for j, target in enumerate(self._task.targets)]
         self._known_at += [clock] * (len(targets) - len(self._known_at))
@@ -85,8 +88,8 @@ class Unfolding:
             [_body(errand, place, bool(here)) for errand, place, here in zip(
                 errands, at, moment.present, strict=True)],
             self.ground, Outcome(), targets, list(range(len(targets))), [*self._known_at],
-            np.where(moment.solved, clock, -1).tolist(),
-            np.where(moment.solved, clock + moment.ends, -1).tolist())
+            np.where(served, clock, -1).tolist(),
+            np.where(served, clock + moment.ends, -1).tolist(), set(lapsed))
         if coming:
             moment = replace(moment, coming=coming, middle=state.middle(self._task.points),
                              middle_now=state.middle(at))
@@ -108,7 +111,7 @@ class Unfolding:
         return timed.Target(
             _place(self._task.place(target.at)), target.skills, "OR" if target.either else "AND",
             target.coalition, target.service, tuple(self._task.after(number)), target.appears,
-            target.lapses)
+            target.lapses, target.worth)
 
 
 def _place(xy: Floats) -> timed.Place:

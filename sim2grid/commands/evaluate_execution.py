@@ -114,10 +114,11 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     """New targets that appear in mid-mission, each at a random decision."""
     impassable: int = 0
     """Cells on the way of a robot on the ground that turn out closed to its kind."""
-    unfold: Literal["following", "arrivals", "hidden", "losses"] | None = None
+    unfold: Literal["following", "arrivals", "lapsing", "hidden", "losses"] | None = None
     """Missions by the clock in which not everything is known (--mode clock): five more targets,
-    each when one is solved, or by the clock, 10 s apart in the mean; all targets hidden until a
-    robot is within 6 m; or in one mission of three a robot is lost within 40 s."""
+    each when one is solved, or by the clock, 10 s apart in the mean, or so that they lapse after 15
+    to 40 s and are worth 1 to 5; all targets hidden until a robot is within 6 m; or in one mission
+    of three a robot is lost within 40 s."""
     search: tuple[Literal["nearest", "sweep", "places", "stay", "middle"], ...] = ()
     """Where targets are hidden: nearest, to the nearest ground not seen yet; sweep, up and down a
     strip each; places, to look from, planned for as if they were targets (lns, policy); default:

@@ -102,6 +102,7 @@ class Record:
     legs: list[Leg] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     solves: list[Solve] = field(default_factory=list)
+    lapsed: list[int] = field(default_factory=list)  # targets of some worth that nobody served
     losses: list[Loss] = field(default_factory=list)
     replans: list[tuple[int, ReplanCause]] = field(default_factory=list)
     expected: dict[int, float] = field(default_factory=dict)  # target: s, by the first plan

@@ -81,6 +81,7 @@ class TargetReport(msgspec.Struct, frozen=True):
     robots: tuple[str, ...]
     distance_m: tuple[float, ...]
     expected_s: float | None = None  # by the clock, when the first plan had it solved
+    worth: float | msgspec.UnsetType = msgspec.UNSET  # of one that may lapse
 
 
 class BatteryReport(msgspec.Struct, frozen=True):
@@ -211,7 +212,8 @@ def target_reports(record: Record, mission: Mission) -> tuple[TargetReport, ...]
             time_s=_round(solve.time_s) if solve else None,
             robots=tuple(mission.robots[i].name for i in solve.robots) if solve else (),
             distance_m=tuple(_round(d) for d in solve.distance_m) if solve else (),
-            expected_s=_round(record.expected[j]) if j in record.expected else None))
+            expected_s=_round(record.expected[j]) if j in record.expected else None,
+            worth=target.worth or msgspec.UNSET))
     return tuple(rows)
 
 

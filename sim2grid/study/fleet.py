@@ -26,7 +26,8 @@ from moonteam.loading import decode_mission, load_mission
 from moonteam.physics.scene import Placement, Scene, build_scene, check_starts, start_pose
 from moonteam.planners import registry, simulate
 from moonteam.planners.base import IntArray, Plan, Snapshot, WholePlanner
-from moonteam.planners.unfolding.draw import EVERY_S, LOSS, SENSOR_M
+from moonteam.planners.unfolding.draw import EVERY_S, LOSS, SENSOR_M, STAYS, WORTH
+from moonteam.planners.unfolding.future import lapsing
 from moonteam.problem import mission as missions
 from moonteam.problem.mission import (
     Event,
@@ -59,9 +60,9 @@ MOST_DRAWS = 10_000
 SLOW_FACTORS = (0.3, 0.7)
 SILENT_DECISIONS = (5, 15)
 
-Unfold = Literal["following", "arrivals", "hidden", "losses"]
+Unfold = Literal["following", "arrivals", "lapsing", "hidden", "losses"]
 """What nobody knows yet in random missions: targets that come when others are solved, or by the
-clock; targets that are hidden; a robot that is lost.
+clock, or that besides lapse and are worth more or less; hidden targets; a robot that is lost.
 """
 MORE = 5
 """Targets that come, beside those that are known."""
@@ -375,8 +376,11 @@ def _unfolding(recipe: Recipe, mission: Mission, passable: dict[str, BoolArray],
         snapshot = Snapshot.start(grid_problem(mission, passable))
         come = _new_targets(MORE, snapshot, mission, rng)
         times = np.cumsum(rng.exponential(EVERY_S, MORE)).round(2).tolist()
-        if recipe.unfold == "arrivals":
-            expects = Prospect(every=EVERY_S)
+        if recipe.unfold != "following":
+            expects = Prospect(every=EVERY_S) if recipe.unfold == "arrivals" else Prospect(
+                every=EVERY_S, worth=WORTH, stays=STAYS)
+            come = [msgspec.structs.replace(t, **lapsing(expects, s, rng))
+                    for t, s in zip(come, times, strict=True)]
             events = [Event(target=t, at_s=s) for t, s in zip(come, times, strict=True)]
         else:
             events = [Event(target=t, at_solved=k) for k, t in enumerate(come, 1)]

@@ -117,6 +117,8 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
             robot.energy_j for robot in row.report.robots) / 1e3, won)),
         "propellant_kg": boot.mean(values(lambda row: sum(
             robot.propellant_kg for robot in row.report.robots), won)),
+        "worth": boot.ratio(values(lambda row: worth_of(row.report)),
+                            values(lambda row: worth_of(row.report, False))),
         **{key: boot.mean(values(partial(_on_soil, key=key), won)) for key in ON_SOIL_KEYS},
     }
     causes = Counter(cause for row in rows for cause, n in row.report.replans.items()
@@ -130,6 +132,13 @@ def summarise(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         "replans_by_cause": dict(sorted(causes.items())),
         "intervals": {key: _ends(figure) for key, figure in figures.items()},
     }
+
+
+def worth_of(report: Report, served: bool = True) -> float | None:
+    """What the targets that may lapse count, those served or all that came; None without any."""
+    found = [(t.worth, t.solved) for t in report.targets
+             if not isinstance(t.worth, msgspec.UnsetType)]
+    return sum(worth for worth, solved in found if solved or not served) if found else None
 
 
 def _a_robot(row: Row, key: str) -> float | None:
@@ -197,6 +206,10 @@ def compare(groups: dict[tuple[str, int, str], list[Row]], by_name: dict[str, Co
                                               for a, b in both), strict=True))
                        for key in ("seconds", "moves")}
             figures["seconds_more"] = boot.mean([a.seconds - b.seconds for a, b in both])
+            worth = [(worth_of(a), worth_of(b)) for a, b in pairs]
+            worth = [two for two in worth if None not in two]
+            if worth:
+                figures["worth"] = Bootstrap(len(worth), seed).ratio(*zip(*worth, strict=True))
             found.append({
                 "site": site, "site_seed": site_seed, "contender": name, "over": other,
                 "missions": len(pairs), "both_solved": len(both),
@@ -293,6 +306,9 @@ WAYS = ["kind", "steepness", "ways", "took / reckoned", "spread"]
 Took / reckoned: the median; reckoned: by the travel field, and what setting out and coming to rest
 cost the kind. Spread: standard deviation of its logarithm; of all kinds, about the medians above.
 """
+WORTH = ["site", "planner", "worth served, of all that came"]
+WORTHIER = ["site", "contender", "over", "missions", "worth served, ratio"]
+"""Where targets may lapse: of all missions, solved or not."""
 MISSIONS = ["mission", "contender", "came to", "s", "s at best, as planned", "decisions"]
 COMPARED = ["site", "contender", "over", "both solved", "only this", "only the other",
             "seconds, ratio", "seconds more", "moves, ratio"]
@@ -360,6 +376,13 @@ def tables(report: dict[str, Any]) -> list[Plain]:
         found.append((ON_SOIL, [[
             where(line), line["planner"], *(spread(line, key, 2) for key in ON_SOIL_KEYS[:2]),
             *(spread(line, key, 0) for key in ON_SOIL_KEYS[2:])] for line in soft]))
+    if worthy := [line for line in report["summary"] if line.get("worth") is not None]:
+        found.append((WORTH, [[where(line), line["planner"], spread(line, "worth", 3)]
+                              for line in worthy]))
+    if worthier := [line for line in report["comparisons"] if "worth" in line]:
+        found.append((WORTHIER, [[where(line), line["contender"], line["over"],
+                                  str(line["missions"]), spread(line, "worth", 3)]
+                                 for line in worthier]))
     if report["options"].get("mission"):
         found.append((MISSIONS, [[
             f"{row['number']} {row['report']['mission']}", row["contender"],

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from moonteam.planners.seconds.base import MS, NEVER, Bools, Int64, Moment
+from moonteam.planners.seconds.base import MS, NEVER, Bools, Int64, Moment, worth_of
 from moonteam.problem.mission import Mission, Place, Target
 from moonteam.problem.rules import centre
 
@@ -139,7 +139,8 @@ class OnGround:
             appears=ms(np.array([max(0.0, t.appears - now) for t in its])),
             lapses=ms(np.array([np.inf if t.lapses is None else t.lapses - now for t in its])),
             free=ms(free), present=present.copy(), solved=solved.copy(), ends=ms(ends),
-            effort=np.ones(robots), limit=round(MS * (self.mission.max_seconds - now)))
+            effort=np.ones(robots), limit=round(MS * (self.mission.max_seconds - now)),
+            worth=worth_of(its))
 
 
 def ms(seconds: Floats) -> Int64:

@@ -20,7 +20,8 @@ from training.mappo.config import Config
 if TYPE_CHECKING:
     from training.commands import compare, imitate, macro, refine
 
-MACRO = ("quick", "paper_team", "any_team", "any_team_further", "unfolding", "searching", "crews")
+MACRO = ("quick", "paper_team", "any_team", "any_team_further", "unfolding", "lapsing", "searching",
+         "crews")
 """Presets of MAPPO on macro-decisions; see `training.commands.macro`."""
 IMITATE = "imitate"
 """Imitation of the exact planner; see `training.commands.imitate`."""

@@ -62,11 +62,14 @@ def certify(problem: Timed, known: Callable[[Timed], Moment] | None = None) -> K
     """
     from moonteam.planners.seconds.base import MS, moment
     from moonteam.planners.seconds.exact import ExactPlanner
+    from moonteam.planners.seconds.leaving import served
 
-    plan = ExactPlanner("makespan").plan((known or moment)(problem))
+    now = (known or moment)(problem)
+    plan = ExactPlanner("makespan").plan(now)
     if plan.status != "optimal" or plan.makespan is None:
         return None
-    return Known(makespan=plan.makespan / MS)
+    worth = None if now.worth is None else round(served(now, plan.services), 6)
+    return Known(makespan=plan.makespan / MS, worth=worth)
 
 
 def make(recipe: Recipe, count: int, seed: int, speeds: tuple[float, ...],

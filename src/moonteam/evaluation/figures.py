@@ -35,6 +35,7 @@ def bars(path: Path, document: dict, panels: Sequence[tuple[str, str, float]]) -
     Where rows say how much of the ground had been seen when (`seen`), one panel more shows that.
     """
     rows = document["summary"]
+    panels = [one for one in panels if any(one[0] in row for row in rows)]
     looked = [row for row in rows if "seen" in row]
     count = len(panels) + bool(looked)
     figure, axes = _axes(1.6 + 3.1 * count, max(1.6 + 0.34 * len(rows), 3.2 * bool(looked)), count)

@@ -41,20 +41,24 @@ from moonteam.planners.unfolding.make import (
 )
 from moonteam.planners.unfolding.state import Outcome
 from moonteam.planners.unfolding.world import World
-from moonteam.problem.timed import Timed
+from moonteam.problem.timed import Known, Timed
 from moonteam.report import provenance, tables
 from moonteam.report.intervals import RESAMPLES, Bootstrap, Figure, share
 from moonteam.report.journal import NOTHING, Kept
 from moonteam.report.progress import track
 from moonteam.report.tables import Column
 
-PANELS = (("gap", "seconds over the first row, %", 100.0),
+PANELS = (("worth_gap", "worth served over the first row, %", 100.0),
+          ("gap", "seconds over the first row, %", 100.0),
           ("waited_gap", "waiting over the first row, %", 100.0),
           ("success", "success", 1.0))
 COVERAGE = 61
 """Points of the line that says how much of the ground has been seen."""
 COLUMNS = (
     Column("success", "success", lambda value: f"{value:.3f}"),
+    Column("worth", "worth served", lambda value: f"{100 * value:.1f} %"),
+    Column("worth_gap", "worth over the first row", lambda value: f"{100 * value:+.2f} %"),
+    Column("worth_bound_gap", "worth over hindsight", lambda value: f"{100 * value:+.1f} %"),
     Column("seconds", "mean seconds", lambda value: f"{value:.2f}"),
     Column("gap", "over the first row", lambda value: f"{100 * value:+.2f} %"),
     Column("bound_gap", "over hindsight", lambda value: f"{100 * value:+.1f} %"),
@@ -145,6 +149,8 @@ class Played:
     decisions: int
     lost: int
     took: float  # s of the machine
+    worth: float = 0.0
+    missed: float = 0.0
     seen: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
@@ -152,7 +158,8 @@ class Played:
         """From what came of it."""
         limit = problem.max_seconds if problem.max_seconds is not None else out.seconds
         return cls(problem.id, out.success, out.reason, out.seconds if out.success else limit,
-                   out.solved, out.waited, out.effort, out.decisions, out.lost, took, out.seen)
+                   out.solved, out.waited, out.effort, out.decisions, out.lost, took, out.worth,
+                   out.missed, out.seen)
 
 
 def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
@@ -197,19 +204,21 @@ def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: s
         if not found:
             raise
     bootstrap = Bootstrap(len(problems), seed)
-    bound = np.array([np.nan if p.optimal is None or p.optimal.bound is None else p.optimal.bound
-                      for p in problems])
+    known = [problem.optimal or Known() for problem in problems]
     first = found[0][1]
     notes = [f"Mission by mission against the first row, {found[0][0].name}, in the same futures. "
              "Missions that fail count with their limit.",
              f"In brackets: 95 % intervals over {len(problems)} missions: of success by Wilson, "
              f"else bootstrap, {RESAMPLES} resamples.",
-             "Hindsight: the least makespan if all had been known from the start and nobody were "
-             "lost; nobody can be faster.",
+             "Hindsight: " + (
+                 "the most worth that could have been served if all had been known from the start. "
+                 "Time is second to worth." if any(one.worth for one in known) else
+                 "the least makespan if all had been known from the start and nobody were lost; "
+                 "nobody can be faster."),
              "A target waits from when there is one until its service starts; hidden ones from the "
              "mission's start.", *_solvable(problems, found), *_causes(found)]
     lacking = [row.name for row in rows[len(found):]]
-    return {"title": title, "summary": [summary(row, played, first, bound, bootstrap)
+    return {"title": title, "summary": [summary(row, played, first, known, bootstrap)
                                         for row, played in found],
             "rows": [_row(row, one, p) for row, played in found
                      for one, p in zip(played, problems, strict=True)],
@@ -217,8 +226,8 @@ def evaluate(problems: Sequence[Timed], rows: Sequence[Row], seed: int, title: s
         {"interrupted": lacking} if lacking else {})
 
 
-def summary(row: Row, played: Sequence[Played], first: Sequence[Played], bound: np.ndarray,
-            bootstrap: Bootstrap) -> dict:
+def summary(row: Row, played: Sequence[Played], first: Sequence[Played],
+            known: Sequence[Known], bootstrap: Bootstrap) -> dict:
     """A row of the report."""
     def column(key: str, of: Sequence[Played] = played) -> np.ndarray:
         return np.array([float(getattr(one, key)) for one in of])
@@ -226,12 +235,21 @@ def summary(row: Row, played: Sequence[Played], first: Sequence[Played], bound: 
     def over(key: str) -> Figure:
         return bootstrap.ratio(column(key) - column(key, first), column(key, first))
 
+    def over_hindsight(values: np.ndarray, least: str) -> Figure:
+        best = np.array([getattr(one, least) or np.nan for one in known])
+        return Figure(*(v - 1 for v in bootstrap.ratio(values, best)))
+
+    offered = column("worth") + column("missed")
     found = {"success": share(column("success")), "seconds": bootstrap.mean(column("seconds")),
              "gap": over("seconds"),
-             "bound_gap": Figure(*(v - 1 for v in bootstrap.ratio(column("seconds"), bound))),
              "waited": bootstrap.mean(column("waited")), "waited_gap": over("waited"),
              "effort": bootstrap.mean(column("effort")),
              "decisions": bootstrap.mean(column("decisions"))}
+    if offered.any():
+        found |= {"worth": bootstrap.ratio(column("worth"), offered), "worth_gap": over("worth"),
+                  "worth_bound_gap": over_hindsight(column("worth"), "worth")}
+    else:
+        found["bound_gap"] = over_hindsight(column("seconds"), "bound")
     return {"planner": row.name, "missions": len(played),
             **{key: figure.value for key, figure in found.items()},
             "intervals": {key: [figure.low, figure.high] for key, figure in found.items()},
@@ -303,4 +321,5 @@ def _row(row: Row, one: Played, problem: Timed) -> dict[str, Any]:
     return {"id": one.id, "planner": row.name, "success": one.success, "reason": one.reason,
             "seconds": one.seconds, "solved": one.solved, "waited": one.waited,
             "effort": one.effort, "decisions": one.decisions, "lost": one.lost,
+            **({"worth": one.worth, "missed": one.missed} if one.worth or one.missed else {}),
             "optimal": {"bound": bound}}

@@ -43,7 +43,7 @@ _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": 
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
          "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "",
          "middle": "M", "middle_now": "N",
-         "lapses": "M", "free": "N", "lost": "N", "effort": "N", "limit": "",
+         "lapses": "M", "worth": "M", "free": "N", "lost": "N", "effort": "N", "limit": "",
          "agent_mask": "N", "target_mask": "M", "unit": ""}
 _PADDING = {"start": FAR, "between": FAR, "lapses": FAR, "lost": FAR}  # zero and False elsewhere
 
@@ -275,7 +275,8 @@ def _play(spec: PointerSpec, params: Any, problems: MacroProblem, count: Array, 
                                           targets), targets, dtype=bool)
         log = log._replace(order=jnp.where(turned, -1, log.order))
         over = (result.terminated | result.truncated) & (pool.episode < count)
-        log = log._replace(solved=result.terminated, served=after.solved | after.serving)
+        log = log._replace(solved=result.terminated,
+                           served=(after.solved & ~after.lapsed) | after.serving)
         at = jnp.where(over, pool.episode, rows * tries)
         done = jax.tree.map(lambda all_, own: all_.at[at].set(own, mode="drop"), pool.done, log)
         episode, following = refilled(over, pool.episode, pool.following)

@@ -43,6 +43,9 @@ class PointerSpec:
     unfolds: bool = False
     """Sees how many targets are still to come, and how far everything is from where they may."""
 
+    worths: bool = False
+    """Sees what it counts to serve each target, where targets may lapse."""
+
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no network."""
         attention.check_sizes(source, self.width, self.heads, self.layers, self.pairs)
@@ -75,6 +78,7 @@ class Outlook:
     preference: Array  # [B] 0 time .. 1 effort
     ahead: Array | None = None
     """[B, E, 3] log of how many come (0 of places to look from), time to where, both at once."""
+    worth: Array | None = None  # [B, M] what serving it counts; 0: it has to be served
 
 
 def look(state: MacroState, preference: Array) -> Outlook:
@@ -127,7 +131,7 @@ def look(state: MacroState, preference: Array) -> Outlook:
         travel=norm(travel), between=norm(best), goal=goal, has=p.has, lacks=lacks,
         either=p.either, service=norm(p.service), ready=norm(ready),
         left=norm(jnp.maximum(p.lapses - state.now, 0.0)), after=waits, home=norm(p.home),
-        preference=preference, ahead=_ahead(state))
+        preference=preference, ahead=_ahead(state), worth=p.worth)
 
 
 def together(times: Array, count: Array, never: float) -> Array:
@@ -195,6 +199,15 @@ def _token_features(view: Outlook) -> tuple[Array, Array]:
     return agents, targets
 
 
+def _worth_features(view: Outlook) -> Array:
+    """[B, M, 4] what each target counts, by itself, beside the most of any, and by time left."""
+    assert view.worth is not None
+    worth = jnp.where(view.targets, view.worth, 0.0)
+    most = jnp.maximum(jnp.max(worth, axis=-1, keepdims=True), 1e-6)
+    return jnp.stack([jnp.log1p(worth), worth / most, (worth > 0).astype(jnp.float32),
+                      worth / most * jnp.exp(-view.left)], axis=-1)
+
+
 def _pair_features(view: Outlook) -> Array:
     """[B, E, E, F] what token j is to token i."""
     has = view.has.astype(jnp.float32)
@@ -249,6 +262,11 @@ class Pointer(nn.Module):
             assert view.ahead is not None
             x = x + nn.Dense(spec.width, use_bias=False, name="ahead",
                              kernel_init=nn.initializers.zeros)(view.ahead)
+        if spec.worths:
+            assert view.worth is not None
+            worth = nn.Dense(spec.width, use_bias=False, name="worth",
+                             kernel_init=nn.initializers.zeros)(_worth_features(view))
+            x = x + jnp.pad(worth, [(0, 0)] * (x.ndim - 2) + [(n, 0), (0, 0)])
         mask = jnp.concatenate([view.agents, view.targets], axis=-1)
         pairs = nn.gelu(nn.Dense(spec.pairs, name="pairs")(_pair_features(view)))
         x = attention.attend(x, pairs, mask, n, spec.layers, spec.heads)
@@ -270,10 +288,11 @@ def point(params: Any, spec: PointerSpec, view: Outlook) -> Pointed:
 
 
 def grafted(spec: PointerSpec, params: Any) -> Any:
-    """Parameters of a network that does not see what is to come, for one that does: it begins as
-    the same policy.
+    """Parameters of a network that does not see what is to come, or what targets are worth, for one
+    that does: it begins as the same policy.
     """
-    return {**params, "ahead": init(spec, jax.random.key(0))["ahead"]}
+    fresh = init(spec, jax.random.key(0))
+    return {**{name: fresh[name] for name in ("ahead", "worth") if name in fresh}, **params}
 
 
 def deepened(spec: PointerSpec, params: Any, layers: int) -> Any:
@@ -298,5 +317,5 @@ def init(spec: PointerSpec, key: Array) -> Any:
         agents=~flag, targets=~flag, free=~flag, spare=number, slow=number, travel=square,
         between=square, goal=square > 0, has=square > 0, lacks=square, either=flag, service=number,
         ready=number, left=number, after=square > 0, home=square, preference=jnp.zeros(()),
-        ahead=jnp.zeros((4, 3)))
+        ahead=jnp.zeros((4, 3)), worth=number)
     return Pointer(spec).init(key, view)["params"]

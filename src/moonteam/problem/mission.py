@@ -111,7 +111,7 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
     By the clock it may say more, as `timed.Target` explains: `service` s, `coalition` by skill
     and number (in place of skills and type), `after` (names of other targets), `appears` and
-    `lapses` s.
+    `lapses` s, and `worth`, without which a target that lapses has failed the mission.
     """
 
     at: Place
@@ -123,6 +123,7 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     after: Annotated[tuple[str, ...], msgspec.Meta(max_length=MOST_TARGETS)] = ()
     appears: float = 0.0
     lapses: float | None = None
+    worth: float = 0.0
 
     @property
     def cell(self) -> Cell:
@@ -312,6 +313,8 @@ def _check_clock(mission: Mission, source: object) -> None:
                 raise fail("after", f"{name!r} is not allowed; {meant(name, names)}other targets: "
                            + others)
         after.append(tuple(numbers[name] for name in target.after))
+        if any(mission.targets[k].worth for k in after[-1]):
+            raise fail("after", timed.NOT_SURE)
         timed.check_times(target, fail)
         timed.check_coalition(target, team, fail)
         if target.lapses is None and target.appears + target.service > mission.max_seconds:
@@ -324,7 +327,7 @@ def _check_clock(mission: Mission, source: object) -> None:
 
 def _check_steps(mission: Mission, source: object) -> None:
     """Raises InputError for what means nothing where a decision is one cell."""
-    later = ("coalition", "service", "after", "appears", "lapses")
+    later = ("coalition", "service", "after", "appears", "lapses", "worth")
     said = [(f"robots[{i}].{key}", getattr(robot, key)) for i, robot in enumerate(mission.robots)
             for key in ("speed", "home", "sensor_m")]
     said += [("expects", mission.expects)]

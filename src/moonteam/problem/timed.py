@@ -43,6 +43,10 @@ Coalition = Annotated[dict[Name, int], msgspec.Meta(max_length=8 * MAX_SKILLS)]
 MOST_SIDE = 1024
 """m of the area in which targets may be hidden."""
 
+MOST_WORTH = 1e6
+"""Of a target."""
+
+NOT_SURE = "it comes after a target that has a worth, and so need not be served"
 MOST_SECONDS = 1e9
 """Of a way, a service or a limit: planners count milliseconds, and a thousand of these add up."""
 
@@ -83,6 +87,8 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     """s before which no service starts; where a mission unfolds, nobody knows of it before."""
     lapses: float | None = None
     """s after which no service starts."""
+    worth: float = 0.0
+    """What it counts to serve it, of a target that may lapse; 0: the mission fails if it does."""
     hidden: bool = False
     """Nobody knows of it before an agent with a sensor has been near enough."""
     following: int = 0
@@ -94,10 +100,15 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What is known of the least makespan: proved, a bound, and what others found, by name."""
+    """What is known of the least makespan: proved, a bound, and what others found, by name.
+
+    Where targets may lapse, it is that of plans which serve the most.
+    """
 
     makespan: float | None = None
     bound: float | None = None
+    worth: float | None = None
+    """The most that can be served where targets may lapse."""
     published: dict[str, float] = {}
 
 
@@ -120,6 +131,11 @@ class Prospect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     loss: Loss | None = None
     scatter: float = 0.0
     """Standard deviation of the logarithm of what ways take over what is expected."""
+    worth: tuple[float, float] | None = None
+    """Least and most that a target which arrives counts, even in between; None: all have to be
+    served."""
+    stays: tuple[float, float] | None = None
+    """Fewest and most s from its arrival until it lapses, even in between; None: it does not."""
 
 
 class Timed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -187,6 +203,9 @@ def check(timed: Timed, source: object, where: str = "") -> Timed:
         check_target(target, len(timed.targets), j, say)
         check_coalition(target, team, say)
     _check_ways(timed, fail)
+    for j, target in enumerate(timed.targets):
+        if any(timed.targets[k].worth for k in target.after):
+            raise fail(f"targets[{j}].after", NOT_SURE)
     for j in after_itself([target.after for target in timed.targets]):
         raise fail(f"targets[{j}].after", "it would come before itself: a circle of targets that "
                    "wait for each other")
@@ -216,6 +235,10 @@ def check_times(target: Any, fail: Any) -> None:
         raise fail("lapses", f"{target.lapses:g} is not allowed; at least `appears`, "
                    f"{target.appears:g}: it would lapse before it appears; at most "
                    f"{MOST_SECONDS:g}")
+    if not 0 <= target.worth <= MOST_WORTH:
+        raise fail("worth", f"{target.worth:g} is not allowed; 0 to {MOST_WORTH:g}")
+    if target.worth and target.lapses is None:
+        raise fail("worth", "is of a target that may lapse; say after how many s: lapses")
 
 
 def check_limit(seconds: float, fail: Any) -> None:
@@ -347,6 +370,8 @@ def _check_windows(timed: Timed, fail: Any) -> None:
             who.setdefault(skill, []).append(i)
     for j, target in enumerate(timed.targets):
         closes = target.lapses
+        if target.worth:  # it need not be reached
+            continue
         if timed.max_seconds is not None:
             last = timed.max_seconds - target.service
             closes = last if closes is None else min(closes, last)
@@ -421,6 +446,15 @@ def check_expects(expects: Prospect, fail: Any) -> None:
                        f"and north, at most {MOST_SIDE} m apart")
     if not 0 <= expects.scatter <= 2:
         raise fail("expects.scatter", f"{expects.scatter:g} is not allowed; 0 to 2")
+    for key, span, most in (("worth", expects.worth, MOST_WORTH),
+                            ("stays", expects.stays, MOST_SECONDS)):
+        if span is not None and not 0 < span[0] <= span[1] <= most:
+            raise fail(f"expects.{key}", f"{list(span)} is not allowed; the least and the most, "
+                       f"above 0, at most {most:g}")
+        if span is not None and expects.every is None:
+            raise fail(f"expects.{key}", "is of targets that arrive; say how often: every")
+    if expects.worth is not None and expects.stays is None:
+        raise fail("expects.worth", "is of targets that may lapse; say after how long: stays")
     loss = expects.loss
     if loss is not None and not (0 <= loss.share <= 1 and 0 < loss.until <= MOST_SECONDS):
         raise fail("expects.loss", f"{loss.share:g} by {loss.until:g} s is not allowed; a share "

@@ -73,8 +73,14 @@ def cell(row: dict, column: Column, spread: bool) -> str:
     return f"{text} [{column.write(low)}, {column.write(high)}]"
 
 
+def told(document: dict, columns: Sequence[Column]) -> list[Column]:
+    """The columns that some row says something of: not all kinds of missions fill all."""
+    return [one for one in columns if any(one.key in row for row in document["summary"])]
+
+
 def markdown(document: dict, columns: Sequence[Column]) -> str:
     """The table with its command, sources and machine, ready for a page of docs."""
+    columns = told(document, columns)
     titles = [document.get("rows_are", "planner"), *(c.title for c in columns)]
     lines = [f"`{document['meta']['command']}`", "",
              "| " + " | ".join(titles) + " |",
@@ -97,7 +103,7 @@ def show(document: dict, columns: Sequence[Column]) -> None:
     from rich.table import Table
 
     console = Console()
-    rows = document["summary"]
+    rows, columns = document["summary"], told(document, columns)
     room = max(1, (console.width - _TITLE_WIDTH) // _VALUE_WIDTH)
     for first in range(0, len(rows), room):
         part = rows[first:first + room]

@@ -65,6 +65,42 @@ def test_both_worlds_go_alike_event_by_event():
         assert own.outcome.success == bool(np.asarray(state.solved).all())
 
 
+def test_both_worlds_let_the_same_lapse():
+    """Random choices in missions whose targets arrive, are worth something and lapse."""
+    held = loading.load_set(paths.find("unfolding/lapsing", "testsets", ".jsonl"))[:12]
+    rng, missed = np.random.default_rng(1), 0.0
+    for held_one in held:
+        alone = tuple(msgspec.structs.replace(t, type="OR") for t in held_one.targets)
+        mission = msgspec.structs.replace(held_one, targets=alone)
+        whole = problem_of(moment(mission))
+        problem = jax.tree.map(lambda x: x[0], stacked([replace(whole, shown=whole.appears)]))
+        state, own, lost = world.reset(problem), World(mission), 0.0
+        for _ in range(80):
+            logits = rng.normal(0, 2, (3, problem.start.shape[1] + 1)).astype(np.float32)
+            free = np.asarray(world.free(state))
+            choice, after, over, *_ = jax.device_get(decided(state, logits))
+            while own.state.now / MS < float(state.now) - 3e-3:  # nobody could choose anything
+                own.step([body.goal for body in own.state.bodies])
+            assert own.state.now / MS == pytest.approx(float(state.now), abs=3e-3)
+            assert {own.state.numbers[j] for j in own.state.lapsed} >= set(
+                np.flatnonzero(state.lapsed & np.asarray(world.known(state))).tolist())
+            orders = [
+                own.state.numbers.index(int(pick)) if is_free and pick < 12 else
+                body.goal if not is_free else -1
+                for body, is_free, pick in zip(own.state.bodies, free, choice, strict=True)]
+            own.step(orders)
+            lost = float((after.lapsed * problem.worth).sum())
+            state = after
+            if over:
+                break
+        while not own.over:
+            own.step([body.goal for body in own.state.bodies])
+        assert own.outcome.success
+        assert own.outcome.missed == pytest.approx(lost, abs=1e-3)
+        missed += lost
+    assert missed > 0
+
+
 @pytest.mark.parametrize("family", [FOLLOWING, ARRIVING], ids=["following", "arriving"])
 def test_the_last_targets_are_not_known_at_the_start(family):
     made = jax.vmap(partial(draw.draw, family))(jax.random.split(jax.random.key(0), 64))

@@ -136,7 +136,7 @@ def team(has, need, start, between, **changes):
         home=np.zeros((n, m), np.float32), home_now=np.zeros(n, np.float32), has=has, need=need,
         either=zero > 0, service=zero, after=np.zeros((m, m), bool), appears=zero, shown=zero,
         following=np.zeros(m, np.int32), sight=np.zeros((m, m), bool), looks=zero > 0,
-        coming=np.int32(0), middle=zero,
+        coming=np.int32(0), middle=zero, worth=zero,
         middle_now=np.zeros(n, np.float32),
         lapses=zero + FAR, free=np.zeros(n, np.float32),
         lost=np.full(n, FAR, np.float32), effort=np.ones(n, np.float32),

@@ -17,7 +17,7 @@ from moonteam.planners.unfolding.world import World
 from moonteam.problem import timed
 from moonteam.problem.timed import Agent, Loss, Prospect, Target, Timed
 
-SETS = ("following", "arrivals", "hidden", "losses", "scatter")
+SETS = ("following", "arrivals", "hidden", "losses", "scatter", "lapsing")
 
 
 def missions(name, count):
@@ -52,6 +52,9 @@ def test_nobody_is_faster_than_hindsight(name):
     for problem in missions(name, 6 if name == "hidden" else 25):
         for planner in (ExactPlanner(), GreedyPlanner()):
             world, _ = played(problem, Replanning(planner, NearestUnseen()))
+            if problem.optimal.worth is not None:
+                assert world.outcome.worth <= problem.optimal.worth + 1e-6, problem.id
+                continue
             assert not world.outcome.success or (
                 world.outcome.seconds >= problem.optimal.bound - 0.02), problem.id
 
@@ -151,6 +154,39 @@ def test_one_follows_when_so_many_are_solved_and_one_appears_by_the_clock():
     assert world.outcome.solves == [6.0, 10.0, 13.0]
     assert [now for now, _ in told] == [0, 1500, 6000, 10000]
     assert world.outcome.waited == pytest.approx((4.0 + 4.0 + 11.5) / 3)
+
+
+def test_what_lapses_is_missed_and_who_was_on_the_way_is_free():
+    problem = mission(
+        [Agent((0.0, 0.0), ("A",)), Agent((0.0, 9.0), ("B",))],
+        [Target((10.0, 0.0), ("A",), lapses=4.0, worth=2.0),
+         Target((0.0, 5.0), ("A", "B"), service=1.0, lapses=9.0, worth=3.0)])
+    world = World(problem)
+    assert world.view().optional
+    world.step([0, 1])  # the first is 10 s away from what lapses after 4
+    assert world.state.now == 4001
+    assert world.view().moment.solved.tolist() == [True, False]
+    assert world.state.bodies[0].phase == "free"
+    assert world.state.place(0) == pytest.approx((4.001, 0.0))
+    assert world.view().ended == 0
+    world.step([1, 1])  # the other waits; too far: 6.4 s from there
+    assert world.state.now == 9001
+    out = world.outcome
+    assert world.over
+    assert (out.success, out.solved, out.worth, out.missed) == (True, 0, 0.0, 5.0)
+    assert out.waited == pytest.approx((4.0 + 9.0) / 2)
+    world = World(problem)
+    while not world.over:
+        world.step([1, 1])
+    assert (world.outcome.worth, world.outcome.missed, world.outcome.seconds) == (3.0, 2.0, 6.0)
+
+
+def test_a_target_without_worth_ends_the_mission_when_it_lapses():
+    problem = mission([Agent((0.0, 0.0), ("A",))], [Target((3.0, 0.0), ("A",), lapses=4.0)])
+    world = World(problem)
+    world.step([-1])
+    assert world.over
+    assert world.outcome.reason == "target 0 lapsed"
 
 
 def test_who_is_lost_in_service_leaves_its_target_to_others():

@@ -20,6 +20,7 @@ from moonteam.grid.macro.types import FAR, MacroProblem
 from moonteam.planners.macro import rollouts, spec_of
 from moonteam.planners.seconds.base import MS, NEVER, Moment
 from moonteam.planners.seconds.exact import ExactPlanner
+from moonteam.planners.seconds.leaving import EXACTLY, served
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.policies.pointer import PointerSpec, look
 from moonteam.policies.policy import Policy
@@ -47,7 +48,8 @@ def moment_of(problem: MacroProblem) -> Moment:
         appears=_ms(problem.appears), lapses=_ms(problem.lapses), free=_ms(problem.free),
         present=np.asarray(problem.agent_mask),
         solved=~np.asarray(problem.target_mask) | np.asarray(problem.looks),
-        ends=np.zeros(targets, np.int64), effort=np.asarray(problem.effort, np.float64))
+        ends=np.zeros(targets, np.int64), effort=np.asarray(problem.effort, np.float64),
+        worth=np.asarray(problem.worth, np.float64) if np.any(problem.worth) else None)
 
 
 def _ms(seconds: Any) -> npt.NDArray[np.int64]:
@@ -69,16 +71,21 @@ class HeldOut:
         spans = [_best(one) for one in each]
         known = [span is not None for span in spans]  # all of them, but for closed-off ground
         self.problems = jax.tree.map(lambda x: x[np.array(known)], self.problems)
-        self.best = np.array([span / MS for span in spans if span is not None])
+        self.best = np.array([span for span in spans if span is not None])
 
     def score(self, policy: Policy) -> dict[str, Any]:
         """Success and mean gap of the makespan by argmax; failures count with the limit.
 
-        Where not everything is known from the start, over hindsight.
+        Where not everything is known from the start, over hindsight; where targets lapse, by how
+        much more could have been served than was.
         """
         if self.family.draw.unfolds:
-            solved, took = jax.device_get(
+            solved, took, missed = jax.device_get(
                 played(spec_of(policy), policy.source.params, self.problems))
+            if self.family.draw.worth[1]:
+                served = self.problems.worth.sum(1) - missed
+                return {"family": self.family.name, "success": float(solved.mean()),
+                        "makespan_gap": float(self.best.mean() / served.mean() - 1.0)}
         else:
             done = rollouts(policy, self.problems)
             solved, took = done.solved[:, 0], done.seconds[:, 0]
@@ -88,31 +95,38 @@ class HeldOut:
 
 
 @partial(jax.jit, static_argnames="spec")
-def played(spec: PointerSpec, params: Any, problems: MacroProblem) -> tuple[Array, Array]:
-    """Whether all was solved [E], and s [E], by the likeliest choices, made anew at every event."""
+def played(spec: PointerSpec, params: Any, problems: MacroProblem) -> tuple[Array, Array, Array]:
+    """Whether all was solved [E], s [E] and worth missed [E], by the likeliest choices, made anew
+    at every event.
+    """
     states = jax.vmap(world.reset)(problems)
     targets = states.solved.shape[1]
     wish = jnp.zeros(states.now.shape)
 
     def step(carry: tuple, _: Any) -> tuple[tuple, None]:
-        states, solved, seconds, over = carry
+        states, solved, seconds, missed, over = carry
         logits = say(params, spec, Hyper(), jax.vmap(look)(states, wish)).logits
         choice, _ = jax.vmap(world.choose)(states, logits, jnp.zeros_like(logits))
         result = jax.vmap(world.step)(states, choice)
         after = jax.vmap(world.loosen)(result.state, jnp.ones(choice.shape, bool))
         seconds = jnp.where(over, seconds, seconds + result.seconds)
+        missed = jnp.where(over, missed, missed + result.missed)
         solved = jnp.where(over, solved, result.terminated)
         ended = over | result.terminated | result.truncated
-        return (trees.where(ended, states, after), solved, seconds, ended), None
+        return (trees.where(ended, states, after), solved, seconds, missed, ended), None
 
     none = jnp.zeros(states.now.shape, bool)
-    (_, solved, seconds, _), _ = jax.lax.scan(
-        step, (states, none, states.now, none), None, 4 * targets)
-    return solved, seconds
+    (_, solved, seconds, missed, _), _ = jax.lax.scan(
+        step, (states, none, states.now, states.now, none), None, 4 * targets)
+    return solved, seconds, missed
 
 
-def _best(moment: Moment) -> int | None:
-    few = int((~moment.solved).sum()) <= EXACT_TO
-    return (ExactPlanner() if few else LocalSearchPlanner(iterations=MOVES)).plan(moment).makespan
+def _best(moment: Moment) -> float | None:
+    """s of the least makespan known, or the most worth that can be served; None: no plan."""
+    few = int((~moment.solved).sum()) <= (EXACT_TO if moment.worth is None else EXACTLY)
+    plan = (ExactPlanner() if few else LocalSearchPlanner(iterations=MOVES)).plan(moment)
+    if moment.worth is not None:
+        return served(moment, plan.services)
+    return None if plan.makespan is None else plan.makespan / MS
 
 

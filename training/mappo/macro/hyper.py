@@ -34,6 +34,8 @@ class Hyper:
     """Gradient norm above which gradients are scaled down."""
     failure: float = 1.0
     """What each target left costs when an episode is cut off, in units of time."""
+    worth: float = 1.0
+    """What each unit of worth costs that lapses, in units of time."""
     tie: float = 0.02
     """Weight that time and way both keep at either end of the preference."""
     spread: bool = False

@@ -110,7 +110,7 @@ def price(hyper: Hyper, preference: Array, result: MacroResult, effort: Array,
           unit: Array) -> Array:
     """[E] what decisions cost, in units."""
     by_time, by_way = 1.0 - preference + hyper.tie, preference + hyper.tie
-    return (by_time * result.seconds + by_way * effort) / unit
+    return (by_time * result.seconds + by_way * effort) / unit + hyper.worth * result.missed
 
 
 def collect(spec: PointerSpec, family: Draw, hyper: Hyper, ground: MacroProblem | None,

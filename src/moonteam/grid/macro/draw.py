@@ -118,6 +118,10 @@ class Draw:
     """Targets, the last of a problem, that nobody knows of before their time."""
     every: float = 10.0
     """Mean s between such times."""
+    worth: tuple[float, float] = (0.0, 0.0)
+    """Least and most that it counts to serve a target; 0: all have to be served."""
+    stays: tuple[float, float] = (15.0, 40.0)
+    """Fewest and most s until a target that is worth something lapses."""
     looks: int = 0
     """Where every target is hidden: places from which robots look, so many along either side."""
     sensor: float = 6.0
@@ -136,7 +140,8 @@ class Draw:
     @property
     def turns(self) -> int:
         """Decisions after which an episode should have ended."""
-        return (4 if self.crews[1] > 1 else 2) * self.entries  # those of a crew go together
+        # Those of a crew go together; what lapses is an event too.
+        return (4 if self.crews[1] > 1 else 3 if self.worth[1] else 2) * self.entries
 
     @property
     def config(self) -> EnvConfig:
@@ -211,11 +216,24 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
         gaps = family.every * jax.random.exponential(key, (targets,))
         when = jnp.where(late, jnp.cumsum(jnp.where(late, gaps, 0.0)), 0.0)
         made = replace(made, appears=when, shown=when)
+    if family.worth[1]:
+        made = lapsing(family, made, jax.random.fold_in(key, 1))
     metric: Metric = "manhattan" if family.metric == "manhattan" else "straight"
     fastest = jnp.max(jnp.where(made.agent_mask, speed, 0.0))
     spots = places(jnp.zeros(2), problem.size - 1.0)
     mean = lambda at: jnp.mean(apart(at, spots, metric), axis=1) / fastest
     return replace(made, middle=mean(problem.target_cells), middle_now=mean(cells))
+
+
+def lapsing(family: Draw, made: MacroProblem, key: Array) -> MacroProblem:
+    """The problem, its targets worth something each, and lapsing after a while."""
+    value, time = jax.random.split(key)
+    targets = made.start.shape[1:]
+    low, high = family.worth
+    worth = jax.random.uniform(value, targets, minval=low, maxval=high)
+    low, high = family.stays
+    stays = jax.random.uniform(time, targets, minval=low, maxval=high)
+    return replace(made, worth=jnp.where(made.target_mask, worth, 0.0), lapses=made.shown + stays)
 
 
 def hidden(family: Draw, made: MacroProblem, problem: Problem, cells: Array) -> MacroProblem:

@@ -43,6 +43,7 @@ class MacroProblem:
     middle: Array  # [M] s from j to where targets may come, in the mean; 0 where nobody can say
     middle_now: Array  # [N] the same from where each agent starts
     lapses: Array  # [M] s after which j does not start; FAR where it does not lapse
+    worth: Array  # [M] what serving it counts, of one that may lapse; 0: it has to be served
     free: Array  # [N] s at which each agent can first set out
     lost: Array  # [N] s at which each agent is lost, which nobody knows before; FAR: never
     effort: Array  # [N] what a second of travel costs each agent
@@ -65,7 +66,7 @@ def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: 
         following=xp.zeros(targets, xp.int32), sight=xp.zeros((targets, targets), bool),
         looks=xp.zeros(targets, bool), coming=xp.zeros((), xp.int32), middle=none,
         middle_now=nobody,
-        lapses=none + xp.float32(FAR), free=nobody, lost=nobody + xp.float32(FAR),
+        lapses=none + xp.float32(FAR), worth=none, free=nobody, lost=nobody + xp.float32(FAR),
         effort=nobody + 1, limit=limit,
         agent_mask=agent_mask, target_mask=target_mask, unit=unit)
 
@@ -86,7 +87,8 @@ class MacroState:
     goal: Array  # [N] int32, the target it is bound to; M: none
     busy: Array  # [N] s until it arrives at its goal, its service ends, or it can first set out
     serving: Array  # [M] bool
-    solved: Array  # [M] bool; padded targets count as solved
+    solved: Array  # [M] bool; padded targets, and those that have lapsed, count as solved
+    lapsed: Array  # [M] bool, those that it had been worth something to serve
     since: Array  # [N] s, when it last became free
     travelled: Array  # [N] s
     served: Array  # [M] s at which each service started; 0 before
@@ -100,5 +102,6 @@ class MacroResult:
     state: MacroState
     seconds: Array  # [] s that passed; at the end, until everybody with a home is there too
     effort: Array  # [] weighted s of travel set out on, at the end with the ways home
-    terminated: Array  # [] bool, every target is solved, whatever has been looked at
+    missed: Array  # [] worth of the targets that lapsed
+    terminated: Array  # [] bool, every target is solved or has lapsed, whatever has been looked at
     truncated: Array  # [] bool, the limit was passed, or nothing can happen any more

@@ -33,8 +33,8 @@ def reset(problem: MacroProblem) -> MacroState:
     start = MacroState(
         problem=problem, now=jnp.zeros((), jnp.float32), node=none, origin=none, leg=zero,
         goal=none, busy=problem.free, serving=jnp.zeros(targets, bool),
-        solved=~problem.target_mask, since=problem.free, travelled=zero,
-        served=jnp.zeros(targets, jnp.float32))
+        solved=~problem.target_mask, lapsed=jnp.zeros(targets, bool), since=problem.free,
+        travelled=zero, served=jnp.zeros(targets, jnp.float32))
     return _run(start, jnp.any(free(start)))[0]
 
 
@@ -66,7 +66,7 @@ def missing(problem: MacroProblem, goal: Array) -> Array:
 def known(state: MacroState) -> Array:
     """[M] bool: somebody knows of it, be it solved or not."""
     problem = state.problem
-    count = jnp.sum(state.solved & problem.target_mask & ~problem.looks)
+    count = jnp.sum(state.solved & ~state.lapsed & problem.target_mask & ~problem.looks)
     found = jnp.any(problem.sight & state.solved[None], axis=1) | ~jnp.any(problem.sight, axis=1)
     return (state.now >= problem.shown - SOON) & (problem.following <= count) & found
 
@@ -109,7 +109,7 @@ def allowed(state: MacroState, goal: Array) -> Array:
     lacking = missing(problem, goal)  # [M, S]
     complete = jnp.all(lacking == 0, axis=1)
     here = jnp.minimum(goal, targets - 1)
-    stuck = (goal < targets) & ~complete[here]
+    stuck = (goal < targets) & ~complete[here] & ~state.lapsed[here]
     loose = problem.agent_mask & ~stuck  # [N]
     has = problem.has.astype(jnp.int32)
     able = (problem.start < FAR).astype(jnp.int32)  # [N, M]
@@ -202,7 +202,8 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     end = jnp.maximum(jnp.max(jnp.where(problem.agent_mask, after.since + way, 0.0)), after.now)
     end = jnp.where(done, end, after.now)
     effort = jnp.sum(problem.effort * (leg + jnp.where(done, way, 0.0)))
-    return MacroResult(after, end - state.now, effort, done, ~done & dead)
+    missed = jnp.sum(jnp.where(after.lapsed & ~state.lapsed, problem.worth, 0.0))
+    return MacroResult(after, end - state.now, effort, missed, done, ~done & dead)
 
 
 def loosen(state: MacroState, who: Array) -> MacroState:
@@ -326,9 +327,12 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     news = jnp.where((news > SOON) & ~state.solved, news, FAR)
     losses = jnp.where(problem.agent_mask & (problem.lost < FAR / 2),
                        jnp.maximum(problem.lost - state.now, 0.0), FAR)
+    optional, pending = problem.worth > 0, ~state.solved & ~state.serving
+    ends = problem.lapses - state.now + 2 * SOON
+    ends = jnp.where(optional & pending & (problem.lapses < FAR / 2), jnp.maximum(ends, 0.0), FAR)
     wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)),
-                       jnp.minimum(jnp.min(news), jnp.min(losses)))
-    late = ~state.solved & ~state.serving & (state.now > problem.lapses + SOON)
+                       jnp.minimum(jnp.min(news), jnp.minimum(jnp.min(losses), jnp.min(ends))))
+    late = pending & ~optional & (state.now > problem.lapses + SOON)
     dead = (wait >= FAR / 2) | jnp.any(late)
     left = jnp.maximum(problem.limit - state.now, 0.0)
     over = wait > left + SOON
@@ -342,11 +346,15 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     ended = jnp.any(jax.nn.one_hot(jnp.where(finished, state.goal, targets), targets,
                                    dtype=bool), axis=0)
     released = (state.busy > 0) & (busy <= 0) & ~bound  # of those that could not yet set out
+    lapses = optional & pending & (now > problem.lapses + SOON)
+    lapsed = state.lapsed | lapses
+    vain = bound & (busy <= 0) & lapsed[here]  # waited there
     after = replace(
-        state, now=now, busy=busy, serving=state.serving & ~ended, solved=state.solved | ended,
-        goal=jnp.where(finished, targets, state.goal),
-        since=jnp.where(finished | released, now, state.since))
-    return _without_lost(after), dead
+        state, now=now, busy=busy, serving=state.serving & ~ended,
+        solved=state.solved | ended | lapses, lapsed=lapsed,
+        goal=jnp.where(finished | vain, targets, state.goal),
+        since=jnp.where(finished | released | vain, now, state.since))
+    return _without_lost(loosen(after, bound & lapsed[here])), dead
 
 
 def _without_lost(state: MacroState) -> MacroState:

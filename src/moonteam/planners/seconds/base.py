@@ -10,8 +10,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +62,21 @@ class Moment:
     coming: int = 0  # targets that are still to be known of
     middle: Int64 | None = None  # [M] ms from each target to where they may come, in the mean
     middle_now: Int64 | None = None  # [N] the same from where each agent is
+    worth: npt.NDArray[np.float64] | None = None
+    """[M] what each target counts that need not be served; 0 of those that do. None: all do."""
+
+    @property
+    def optional(self) -> Int64:
+        """Open targets that need not be served."""
+        if self.worth is None:
+            return np.zeros(0, np.int64)
+        return np.flatnonzero(~self.solved & (self.worth > 0))
+
+    def without(self, targets: Int64) -> Moment:
+        """The same, these targets neither open nor ever to be served."""
+        solved, ends = self.solved.copy(), self.ends.copy()
+        solved[targets], ends[targets] = True, 0
+        return replace(self, solved=solved, ends=ends)
 
     @property
     def plain(self) -> bool:
@@ -125,6 +140,12 @@ def closes(target: Target) -> int:
     return NEVER if target.lapses is None else math.floor(MS * target.lapses + 1e-6)
 
 
+def worth_of(targets: Sequence[Any]) -> npt.NDArray[np.float64] | None:
+    """[M] see `Moment.worth`; of a scenario's targets or a mission's."""
+    worth = np.array([target.worth for target in targets], float)
+    return worth if worth.any() else None
+
+
 def moment(timed: Timed, skills: Sequence[str] | None = None) -> Moment:
     """A scenario's first moment: every way by its metric and each agent's speed.
 
@@ -164,7 +185,8 @@ def moment(timed: Timed, skills: Sequence[str] | None = None) -> Moment:
         solved=np.zeros(len(targets), bool),
         ends=np.zeros(len(targets), np.int64),
         effort=np.ones(len(agents)),
-        limit=NEVER if timed.max_seconds is None else round(MS * timed.max_seconds))
+        limit=NEVER if timed.max_seconds is None else round(MS * timed.max_seconds),
+        worth=worth_of(targets))
 
 
 class Needs(Protocol):
@@ -203,8 +225,10 @@ def problems(now: Moment, services: tuple[Service, ...]) -> list[str]:
     """
     said: list[str] = []
     served = sorted(service.target for service in services)
-    if served != np.flatnonzero(~now.solved).tolist():
-        said.append(f"serves {served}, open are {np.flatnonzero(~now.solved).tolist()}")
+    open_ = np.flatnonzero(~now.solved).tolist()
+    left = set(now.optional.tolist()) - set(served)
+    if served != [j for j in open_ if j not in left]:
+        said.append(f"serves {served}, open are {open_}")
     ends = {j: int(now.ends[j]) for j in np.flatnonzero(now.solved).tolist()}
     ends |= {service.target: service.end for service in services}
     where: dict[int, Service] = {}
@@ -266,7 +290,7 @@ def timed_again(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
                 ) -> tuple[Service, ...] | None:
     """The services of an order, each as soon as its team can be there; None where that is no plan.
 
-    Targets that are solved are left out; what is open and not in it makes it no plan.
+    Targets that are solved are left out; what has to be served and is not in it makes it no plan.
     """
     at: dict[int, int] = {}
     free = moment.free.copy()
@@ -291,7 +315,8 @@ def timed_again(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
         ends[j] = end
         for a in team:
             at[a], free[a] = j, end
-    if len(ends) < len(moment.solved):
+    missing = np.setdiff1d(np.flatnonzero(~moment.solved), moment.optional)
+    if not ends.keys() >= set(missing.tolist()):
         return None
     done = tuple(sorted(services, key=lambda one: (one.start, one.end)))
     return done if makespan(moment, done) <= moment.limit else None

@@ -15,6 +15,7 @@ from typing import Any
 
 from moonteam.planners.kind import ortools
 from moonteam.planners.seconds.base import NEVER, Moment, TimedPlan, problems
+from moonteam.planners.seconds.leaving import sharing
 from moonteam.planners.seconds.local import Best, compiled, search
 from moonteam.planners.seconds.search.goal import (
     Objective,
@@ -66,6 +67,10 @@ class CpSatPlanner:
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit, with its bound."""
         compiled()
+        return self.plan_all(moment) if moment.worth is None else sharing(self, moment)
+
+    def plan_all(self, moment: Moment) -> TimedPlan:
+        """The best plan found that serves all that is open."""
         began = time.perf_counter()
         until = began + self.time_limit
         opened = compact(moment)

@@ -16,6 +16,7 @@ import numpy as np
 from moonteam.errors import InputError
 from moonteam.planners.seconds import base
 from moonteam.planners.seconds.base import NEVER, TRIAL, Moment, TimedPlan, makespan
+from moonteam.planners.seconds.leaving import leaving
 from moonteam.planners.seconds.local import search
 from moonteam.planners.seconds.search import labels, plain
 from moonteam.planners.seconds.search.goal import (
@@ -95,7 +96,13 @@ class ExactPlanner:
         self.time_limit = time_limit
 
     def plan(self, moment: Moment) -> TimedPlan:
-        """The best plan. Raises InputError for too many targets or agents."""
+        """The best plan, of what it is best to serve. Raises InputError for too many targets or
+        agents.
+        """
+        return self.plan_all(moment) if moment.worth is None else leaving(self.plan_all, moment)
+
+    def plan_all(self, moment: Moment) -> TimedPlan:
+        """The best plan that serves all that is open."""
         if self.time_limit is not None:
             compiled()
         began = time.perf_counter()

@@ -8,6 +8,7 @@ import numpy as np
 
 from moonteam.compilation import njit
 from moonteam.planners.seconds.base import NEVER, Int64, Moment, TimedPlan, makespan
+from moonteam.planners.seconds.leaving import leaving
 from moonteam.planners.seconds.search.decode import choose
 from moonteam.planners.seconds.search.goal import answer, infeasible, lists, schedule
 from moonteam.planners.seconds.search.work import Open, compact, places
@@ -70,7 +71,15 @@ class GreedyPlanner:
     name = "greedy"
 
     def plan(self, moment: Moment) -> TimedPlan:
-        """A plan at once. Where targets lapse it may find none although there is one."""
+        """A plan at once. Where targets lapse it may find none although there is one; those that
+        need not be served are taken on by their worth.
+        """
+        if moment.worth is None:
+            return self.plan_all(moment)
+        return leaving(self.plan_all, moment, exactly=False)
+
+    def plan_all(self, moment: Moment) -> TimedPlan:
+        """A plan that serves all that is open."""
         began = time.perf_counter()
         opened = compact(moment)
         if opened.reason:

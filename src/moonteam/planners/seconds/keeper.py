@@ -16,9 +16,9 @@ from moonteam.planners.seconds.base import (
     Service,
     TimedPlan,
     TimedPlanner,
-    makespan,
     timed_again,
 )
+from moonteam.planners.seconds.leaving import better
 
 WAIT, HOME = -1, -2
 """Choices beside the number of a target."""
@@ -47,10 +47,8 @@ class Keeper:
         kept = timed_again(moment, self._order)
         self.plan = self._planner.plan(moment)
         self.first = self.first or self.plan
-        better = self.plan.status != "infeasible" and (
-            kept is None or makespan(moment, self.plan.services)
-            < makespan(moment, kept) - self._margin)
-        if better:
+        if self.plan.status != "infeasible" and (
+                kept is None or better(moment, self.plan.services, kept, self._margin)):
             self._order = order_of(self.plan)
         elif kept is None:
             self._order = []

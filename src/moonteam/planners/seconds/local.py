@@ -14,6 +14,7 @@ import numpy as np
 from moonteam.planners.seconds import base
 from moonteam.planners.seconds.base import NEVER, Int64, Moment, TimedPlan, makespan
 from moonteam.planners.seconds.greedy import greedy
+from moonteam.planners.seconds.leaving import sharing
 from moonteam.planners.seconds.search import annealing
 from moonteam.planners.seconds.search.goal import (
     Objective,
@@ -280,6 +281,10 @@ class LocalSearchPlanner:
         """The best plan found within the limit."""
         if self.time_limit is not None:
             compiled()
+        return self.plan_all(moment) if moment.worth is None else sharing(self, moment)
+
+    def plan_all(self, moment: Moment) -> TimedPlan:
+        """The best plan found that serves all that is open."""
         began = time.perf_counter()
         opened = compact(moment)
         if opened.reason:

@@ -34,7 +34,9 @@ def problem_of(now: Moment) -> MacroProblem:
         "middle": zero if now.middle is None else _seconds(now.middle),
         "middle_now": np.zeros(len(start), np.float32) if now.middle_now is None
         else _seconds(now.middle_now),
-        "lapses": _seconds(now.lapses), "free": _seconds(now.free),
+        "lapses": _seconds(now.lapses),
+        "worth": zero if now.worth is None else now.worth.astype(np.float32),
+        "free": _seconds(now.free),
         "lost": np.full(len(start), FAR, np.float32),
         "effort": now.effort.astype(np.float32), "limit": _seconds(np.asarray(now.limit)),
         "agent_mask": now.present, "target_mask": ~now.solved, "unit": unit_of(start, has, need)}

@@ -27,6 +27,7 @@ from moonteam.planners.seconds.base import (
     makespan,
     timed_again,
 )
+from moonteam.planners.seconds.leaving import served
 from moonteam.planners.seconds.macro import problem_of
 from moonteam.planners.seconds.search.goal import Objective
 from moonteam.planners.seconds.search.work import compact
@@ -76,16 +77,20 @@ class PolicyPlanner:
     def _best(self, now: Moment, played: Rollouts, row: int) -> tuple[Service, ...] | None:
         cost = self._prices[0] * played.seconds[row] + self._prices[1] * played.effort[row]
         cost = np.where(played.solved[row], cost, np.inf)
-        best, least = None, np.inf
-        for k in np.argsort(cost, kind="stable")[:MOST_TIMED].tolist():
+        left = np.zeros(len(cost)) if now.worth is None else np.isnan(
+            played.start[row][:, now.optional]) @ now.worth[now.optional]
+        best, least = None, (np.inf, np.inf)
+        for k in np.lexsort((cost, left))[:MOST_TIMED].tolist():
             services = None if cost[k] == np.inf else _timed(now, played, row, k)
             if services is not None and (price := self._price(now, services)) < least:
                 best, least = services, price
         return best
 
-    def _price(self, now: Moment, services: tuple[Service, ...]) -> float:
-        return (self._prices[0] * makespan(now, services)
-                + self._prices[1] * effort(now, services)) / MS
+    def _price(self, now: Moment, services: tuple[Service, ...]) -> tuple[float, float]:
+        """What is left out, and what the rest costs."""
+        return -served(now, services), (
+            self._prices[0] * makespan(now, services)
+            + self._prices[1] * effort(now, services)) / MS
 
     def _plan(self, now: Moment, services: tuple[Service, ...] | None, seconds: float
               ) -> TimedPlan:
@@ -104,12 +109,12 @@ def _timed(now: Moment, played: Rollouts, row: int, k: int) -> tuple[Service, ..
     targets = len(now.solved)
     start, end = played.start[row, k, :targets], played.end[row, k, :targets]
     sent = played.order[row, k, :len(now.present), :targets]
-    served = np.flatnonzero(np.isfinite(start) & ~now.solved)
+    done = np.flatnonzero(np.isfinite(start) & ~now.solved)
     # Of services that start together without a length, what comes before, then who set out first.
-    by_time = np.lexsort((sent.max(0)[served], macro.depth(now.after)[served], end[served],
-                          start[served]))
+    by_time = np.lexsort((sent.max(0)[done], macro.depth(now.after)[done], end[done],
+                          start[done]))
     order = [(j, tuple(np.flatnonzero(sent[:, j] >= 0).tolist()))
-             for j in served[by_time].tolist()]
+             for j in done[by_time].tolist()]
     whole = timed_again(now, order)
     fewer = [(j, _needed(team, j, now, sent[:, j])) for j, team in order]
     if fewer == order:

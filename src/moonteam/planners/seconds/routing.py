@@ -19,6 +19,7 @@ import numpy as np
 from moonteam.planners.kind import ortools
 from moonteam.planners.seconds import base
 from moonteam.planners.seconds.base import Moment, TimedPlan, problems
+from moonteam.planners.seconds.leaving import sharing
 from moonteam.planners.seconds.search.goal import (
     Objective,
     answer,
@@ -87,6 +88,10 @@ class RoutingPlanner:
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit."""
         loaded()
+        return self.plan_all(moment) if moment.worth is None else sharing(self, moment)
+
+    def plan_all(self, moment: Moment) -> TimedPlan:
+        """The best plan found that serves all that is open."""
         began = time.perf_counter()
         opened = compact(moment)
         if opened.reason:

@@ -33,7 +33,7 @@ from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.keeper import WAIT, choices, order_of
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.labels import MAX_AGENTS
-from moonteam.planners.unfolding.deciders import NOT_DONE, Goal
+from moonteam.planners.unfolding.deciders import NOT_DONE, Goal, by_time
 from moonteam.planners.unfolding.future import Future, future, may_lose
 from moonteam.planners.unfolding.pointing import begun, moments, problem_in, said
 from moonteam.planners.unfolding.state import distances
@@ -200,25 +200,28 @@ class LookingAhead:
                 firsts.append(np.repeat(np.where(tries < len(one.open_), tries, size), some, 0))
                 bounds.append(np.tile(one.bound, (len(tries) * some, 1)))
             whole: MacroProblem = jax.tree.map(lambda *x: np.concatenate(x), *problems)
-            span, served = self._rolled(whole, *(np.concatenate(x)
-                                                 for x in (rows, firsts, bounds)))
+            played = self._rolled(whole, *(np.concatenate(x) for x in (rows, firsts, bounds)))
             ends = np.cumsum([len(row) for row in rows])[:-1]
-            for b, own, starts in zip(missions, np.split(span, ends), np.split(served, ends),
-                                      strict=True):
-                found[b] = self._cost(asked[b], own, starts).reshape(-1, some)
+            for b, *own in zip(missions, *(np.split(x, ends) for x in played), strict=True):
+                found[b] = self._cost(asked[b], *own).reshape(-1, some)
         return found
 
-    def _cost(self, asked: _Asked, span: np.ndarray, served: np.ndarray) -> np.ndarray:
-        """[rollouts] s that count, of a mission's makespans and its services' starts [., T]."""
+    def _cost(self, asked: _Asked, span: np.ndarray, served: np.ndarray,
+              missed: np.ndarray) -> np.ndarray:
+        """[rollouts] what counts, of a mission's makespans, its services' starts [., T] and the
+        worth of what was not served.
+        """
+        if asked.view.optional:
+            return missed + by_time(span, asked.view.state.limit / MS)
         if self._goal == "makespan":
             return span
         first, targets = len(asked.open_), np.flatnonzero(asked.open_ < len(asked.view.targets))
         return served[:, [*targets, *range(first, first + asked.view.coming)]].sum(1)
 
     def _rolled(self, problems: MacroProblem, row: np.ndarray, first: np.ndarray,
-                bound: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[rollouts] s to the end and [rollouts, T] s to each service; of each its problem's row,
-        what everybody does first, who is bound.
+                bound: np.ndarray) -> tuple[np.ndarray, ...]:
+        """[rollouts] s to the end, [rollouts, T] s to each service and [rollouts] worth not
+        served; of each its problem's row, what everybody does first, who is bound.
         """
         found, rows = [], ROWS if len(row) > 2 * FEW else FEW
         for at in range(0, len(row), rows):
@@ -226,9 +229,8 @@ class LookingAhead:
             part = jax.tree.map(lambda x, own=own: x[row[own]], problems)
             found.append(_played(self._spec, self._params, part, bound[own],
                                  first[own].astype(np.int32), self._preference))
-        span, served = (np.concatenate(x)[:len(row)].astype(np.float64)
-                        for x in zip(*jax.device_get(found), strict=True))
-        return span, served
+        return tuple(np.concatenate(x)[:len(row)].astype(np.float64)
+                     for x in zip(*jax.device_get(found), strict=True))
 
 
 def sure(view: View) -> bool:
@@ -286,21 +288,23 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     now = view.now / MS
     need = np.zeros((count, size, known.need.shape[1]), np.int32)
     columns: dict[str, Any] = {"need": need}
-    for name in ("either", "service", "appears", "lapses", "shown", "following", "looks"):
+    for name in ("either", "service", "appears", "lapses", "worth", "shown", "following", "looks"):
         values = np.asarray(getattr(known, name))
         column = np.full((count, size), FAR if name == "lapses" else 0, values.dtype)
         column[:, :len(open_)] = values[open_]
         columns[name] = column
     need[:, :len(open_)] = known.need[open_]
     under_way = int((view.moment.ends > 0).sum())
-    ended = int(view.moment.solved.sum()) - under_way
     for f, targets in enumerate(after):
         for k, target in enumerate(targets, len(open_)):
             asks = target.needs()
             need[f, k, :len(state.names)] = [asks.get(skill, 0) for skill in state.names]
             columns["either"][f, k] = target.type == "OR" and not target.coalition
             columns["appears"][f, k] = columns["shown"][f, k] = max(target.appears - now, 0.0)
-            columns["following"][f, k] = max(target.following - ended - under_way, 0)
+            columns["worth"][f, k] = target.worth
+            if target.lapses is not None:
+                columns["lapses"][f, k] = max(target.lapses - now, 0.0)
+            columns["following"][f, k] = max(target.following - view.ended - under_way, 0)
     waits = np.zeros((count, size, size), bool)
     waits[:, :len(open_), :len(open_)] = known.after[np.ix_(open_, open_)]
     area = None if state.problem.expects is None else state.problem.expects.area
@@ -354,9 +358,9 @@ def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
 
 @partial(jax.jit, static_argnames="spec")
 def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, first: Array,
-            preference: Array) -> tuple[Array, Array]:
-    """[R] s from now to the end, if the team does `first` [R, N] and then what is likeliest; and
-    [R, T] s at which each service starts.
+            preference: Array) -> tuple[Array, Array, Array]:
+    """[R] s from now to the end, if the team does `first` [R, N] and then what is likeliest; [R, T]
+    s at which each service starts; and [R] the worth of what never is served.
     """
     begin = begun(problems, bound)
     worst = NOT_DONE * problems.limit
@@ -377,5 +381,6 @@ def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array
     start = go((begin, jnp.zeros(first.shape[0], bool), worst, 0), first)
     end, _, cost, _ = jax.lax.while_loop(
         lambda carry: jnp.any(~carry[1]) & (carry[3] < LONGEST), likeliest, start)
-    late = ~end.solved & ~end.serving
-    return cost, jnp.where(late, worst[:, None], end.served)
+    late = end.lapsed | (~end.solved & ~end.serving)
+    missed = jnp.sum(jnp.where(late, end.problem.worth, 0.0), axis=1)
+    return cost, jnp.where(late, worst[:, None], end.served), missed

@@ -26,12 +26,20 @@ OPTIONS = 6
 NOT_DONE = 2.0
 """Times its limit that an imagined mission counts which does not end well."""
 
+TIE = 0.01
+"""Worth of a mission's whole limit where targets may lapse."""
+
 Goal = Literal["makespan", "waiting"]
 GOALS: tuple[Goal, ...] = ("makespan", "waiting")
 """What counts in an imagined mission: when it ends, or how long its targets wait."""
 
 Choose = Callable[[list[View]], list[np.ndarray]]
 """Of missions at an event [B], what everybody goes for, [N] each."""
+
+
+def by_time(seconds: Any, limit: float) -> Any:
+    """What is left to time where worth counts: a tie is broken by it."""
+    return TIE * seconds / limit
 
 
 class Decider(Protocol):
@@ -164,6 +172,8 @@ class OverFutures:
     def _cost(self, world: World) -> float:
         """s of an imagined mission, from its start; or of waiting, a target."""
         out = world.outcome
+        if out.success and (out.worth or out.missed):
+            return out.missed + by_time(out.seconds, world.state.limit / MS)
         if out.success:
             return out.waited if self._goal == "waiting" else out.seconds
         return NOT_DONE * world.state.limit / MS

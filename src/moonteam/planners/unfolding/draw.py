@@ -4,7 +4,8 @@ following: the paper's 5 + 5: each of the first five targets that is solved make
 one cell a second, along x and y. arrivals: three targets known from the start, five more by a
 clock. hidden: five targets to be found by three robots of unlike speed that see 6 m. losses: teams
 of four robots, three skills and eight targets, and in one mission of three a robot is lost.
-scatter: eight targets known from the start, whose ways take more or less than expected.
+scatter: eight targets known from the start, whose ways take more or less than expected. lapsing:
+two targets known from the start, ten more by a clock, each worth something else, and each lapses.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ import numpy as np
 
 from moonteam.grid.scenarios import generate
 from moonteam.planners.seconds.base import Moment, moment
+from moonteam.planners.unfolding.future import lapsing
 from moonteam.problem import timed
 from moonteam.problem.timed import Loss, Prospect, Timed
 
 AREA = (0.0, 0.0, 31.0, 31.0)
 EVERY_S, SENSOR_M = 10.0, 6.0
 LOSS = Loss(share=1 / 3, until=40.0)
+OFTEN_S, WORTH, STAYS = 8.0, (1.0, 5.0), (15.0, 40.0)
 SCATTER = 0.084
 """Of ways of our own robots in physics, about the median of their kind and steepness: `moonteam
 evaluate execution --site mare highland --count 100 --mode clock --planner exact`."""
@@ -45,7 +48,9 @@ FAMILIES = {
     "arrivals": Family(300.0, 8, Prospect(more=5, every=EVERY_S, area=AREA)),
     "hidden": Family(600.0, 5, Prospect(more=5, area=AREA)),
     "losses": Family(300.0, 8, Prospect(area=AREA, loss=LOSS), agents=4, skills=3),
-    "scatter": Family(300.0, 8, Prospect(scatter=SCATTER))}
+    "scatter": Family(300.0, 8, Prospect(scatter=SCATTER)),
+    "lapsing": Family(300.0, 12, Prospect(more=10, every=OFTEN_S, area=AREA, worth=WORTH,
+                                          stays=STAYS))}
 
 
 def draws(name: str, seed: int, speeds: tuple[float, ...]) -> Iterator[Timed]:
@@ -73,6 +78,11 @@ def _draw(name: str, rng: np.random.Generator, speeds: tuple[float, ...]) -> Tim
         times = np.cumsum(rng.exponential(EVERY_S, family.expects.more)).round(3).tolist()
         targets[first:] = [change(t, appears=s)
                            for t, s in zip(targets[first:], times, strict=True)]
+    elif name == "lapsing":
+        gaps = rng.exponential(OFTEN_S, family.expects.more)
+        times = [*[0.0] * first, *np.cumsum(gaps).round(3).tolist()]
+        targets = [change(t, appears=s, **lapsing(family.expects, s, rng))
+                   for t, s in zip(targets, times, strict=True)]
     elif name == "hidden":
         targets = [change(t, hidden=True) for t in targets]
         agents = [change(agent, sensor=SENSOR_M) for agent in agents]

@@ -35,8 +35,7 @@ class Future:
 def future(view: View, rng: Rng) -> Future:
     """A future drawn from `view.expects`, given all that is known."""
     expects, now = view.expects, view.now / MS
-    solved = sum(end == 0 and done for end, done in zip(
-        view.moment.ends.tolist(), view.moment.solved.tolist(), strict=True))
+    solved = view.ended
     coming = []
     for k in range(view.coming):
         skills, kind = asked(view.state.names, tuple(a.skills for a in view.agents), rng)
@@ -45,12 +44,22 @@ def future(view: View, rng: Rng) -> Future:
             target = msgspec.structs.replace(target, hidden=True)
         elif expects.every is not None:
             now += float(rng.exponential(expects.every))
-            target = msgspec.structs.replace(target, appears=now)
+            target = msgspec.structs.replace(target, appears=now, **lapsing(expects, now, rng))
         else:
             target = msgspec.structs.replace(target, following=solved + k + 1)
         coming.append(target)
     return Future(tuple(coming), _lost(view, rng), _pace(expects, (
         len(view.agents), len(view.targets) + len(coming)), rng))
+
+
+def lapsing(expects: Prospect, appears: float, rng: Rng) -> dict[str, float]:
+    """What a target that appears counts, and when it lapses, by the names of its fields."""
+    found = {}
+    if expects.worth is not None:
+        found["worth"] = round(float(rng.uniform(*expects.worth)), 1)
+    if expects.stays is not None:
+        found["lapses"] = round(appears + float(rng.uniform(*expects.stays)), 3)
+    return found
 
 
 def asked(names: tuple[str, ...], team: tuple[tuple[str, ...], ...], rng: Rng

@@ -47,6 +47,8 @@ class Outcome:
     effort: float = 0.0  # of all robots, under way
     decisions: int = 0
     lost: int = 0
+    worth: float = 0.0  # served, of targets that may lapse
+    missed: float = 0.0  # not served
     solves: list[float] = field(default_factory=list)  # s of each
     seen: list[tuple[float, float]] = field(default_factory=list)  # s, share of the area seen
 
@@ -71,6 +73,7 @@ class State:
     known_at: list[int] = field(default_factory=list)  # [M]
     served_at: list[int] = field(default_factory=list)  # [M] when its service started, or -1
     ends: list[int] = field(default_factory=list)  # [M] when its service ends, or -1
+    lapsed: set[int] = field(default_factory=set)  # targets that it had been worth to serve
     _known: Moment | None = None
 
     def copy(self) -> State:
@@ -79,7 +82,7 @@ class State:
             self.problem, self.names, self.now, [replace(body) for body in self.bodies],
             None if self.ground is None else self.ground.copy(),
             Outcome(solves=[*self.outcome.solves]), [*self.targets], [*self.numbers],
-            [*self.known_at], [*self.served_at], [*self.ends], self._known)
+            [*self.known_at], [*self.served_at], [*self.ends], {*self.lapsed}, self._known)
 
     @property
     def limit(self) -> int:
@@ -127,7 +130,8 @@ class State:
             lapses=np.where(known.lapses >= NEVER, NEVER, known.lapses - self.now),
             free=np.array(free, np.int64),
             present=np.array([body.phase != "lost" for body in self.bodies], bool),
-            solved=np.array(self.served_at, np.int64) >= 0,
+            solved=np.array([served >= 0 or j in self.lapsed
+                             for j, served in enumerate(self.served_at)], bool),
             ends=np.maximum(np.array(self.ends, np.int64) - self.now, 0),
             limit=max(self.limit - self.now, 0), coming=coming,
             middle=self.middle(self._spots) if coming else None,

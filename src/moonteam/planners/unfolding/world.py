@@ -45,6 +45,16 @@ class View:
     state: State
     looks: tuple[Look, ...] = ()  # places to look from, the last columns of `moment`
 
+    @property
+    def ended(self) -> int:
+        """Targets whose services have ended."""
+        return int((self.moment.solved & (self.moment.ends == 0)).sum()) - len(self.state.lapsed)
+
+    @property
+    def optional(self) -> bool:
+        """Whether there are, or may come, targets that need not be served."""
+        return self.expects.worth is not None or any(target.worth for target in self.targets)
+
     def imagine(self, coming: Sequence[Target], lost: Sequence[float | None],
                 pace: np.ndarray | None = None) -> World:
         """A world that goes on from here with this future.
@@ -196,7 +206,8 @@ class World:
         for target, served in zip(state.targets, state.served_at, strict=True):
             if served < 0 and opens(target) > now:
                 found.append(opens(target))
-            if served < 0 and target.lapses is not None:
+            if served < 0 and target.lapses is not None and not (
+                    target.worth and closes(target) < now):
                 found.append(max(now, closes(target) + 1))
         return min(*found, self._found_at(min(found)), NEVER)
 
@@ -225,7 +236,7 @@ class World:
     def _settle(self) -> None:
         """All that is due at this moment, until nothing more is."""
         while (self._lose() | self._end_services() | self._arrive() | self._find()
-               | self._appear() | self._start_services()):
+               | self._appear() | self._start_services() | self._lapse()):
             pass
         self._judge()
 
@@ -318,16 +329,30 @@ class World:
             some = True
         return some
 
+    def _lapse(self) -> bool:
+        """Targets that need not be served are over; who went or waited for them is free."""
+        state = self.state
+        over = {j for j, target in enumerate(state.targets) if target.worth and j not in (
+            state.lapsed) and state.served_at[j] < 0 and state.now > closes(target)}
+        state.lapsed |= over
+        self._due |= bool(over)
+        for i, body in enumerate(state.bodies):
+            if body.goal in over and body.phase in ("going", "there"):
+                self._stop(i, state.place(i))
+        return bool(over)
+
     def _judge(self) -> None:
         """Ends what is done, or can never be."""
         state = self.state
         team = [i for i, body in enumerate(state.bodies) if body.phase != "lost"]
-        if not self._coming and all(0 <= end <= state.now for end in state.ends):
+        if not self._coming and all(0 <= end <= state.now or j in state.lapsed
+                                    for j, end in enumerate(state.ends)):
             homes = [(state.place(i), state.problem.agents[i].home) for i in team]
             if all(home is None or math.dist(at, home) < 1e-6 for at, home in homes):
                 self._end("")
             return
-        for j in [j for j, served in enumerate(state.served_at) if served < 0]:
+        for j in [j for j, served in enumerate(state.served_at)
+                  if served < 0 and not state.targets[j].worth]:
             if state.now > closes(state.targets[j]):
                 self._end(f"target {state.numbers[j]} lapsed")
                 return
@@ -342,10 +367,14 @@ class World:
             if body.phase != "lost":
                 self._stop(i, state.place(i))
         out.success, out.reason, out.seconds = not reason, reason, state.now / MS
-        waits = [(served if served >= 0 else state.now)
+        waits = [(served if served >= 0 else min(state.now, closes(target)))
                  - (0 if target.hidden else max(known, opens(target)))
                  for served, known, target in zip(state.served_at, state.known_at, state.targets,
                                                   strict=True)]
         waits += [state.now for _, target in self._coming if target.hidden]
+        worth = [target.worth for target in state.targets]
+        out.worth = sum(own for own, served in zip(worth, state.served_at, strict=True)
+                        if served >= 0)
+        out.missed = sum(worth) - out.worth + sum(target.worth for _, target in self._coming)
         out.waited = float(np.mean(waits)) / MS if waits else 0.0
         out.effort = sum(body.travelled for body in state.bodies)

@@ -142,9 +142,10 @@ def pointer_graph(policy: PolicyFile, spec: PointerSpec) -> ModelProto:
 
     Raises InputError for one that sees what is still to come: that is no input of the file.
     """
-    if spec.unfolds:
+    if spec.unfolds or spec.worths:
         raise InputError("export", "a policy for missions that unfold is not exported; it sees "
-                         "what is still to come, which is no input of the file")
+                         "what is still to come, or what targets are worth, which is no input of "
+                         "the file")
     g = Graph(policy.params)
     agents, targets = _tokens(g)
     x = g.join(g.dense(g.params["agent"], agents), g.dense(g.params["target"], targets), axis=1)
