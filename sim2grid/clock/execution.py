@@ -28,7 +28,7 @@ from moonteam.problem.scenario import Scenario
 from moonteam.robots.base import CONTROL_PERIOD
 from sim2grid.clock import steer
 from sim2grid.clock.errand import Errand
-from sim2grid.clock.happenings import Happenings
+from sim2grid.clock.happenings import LATE_S, Happenings
 from sim2grid.clock.roads import Floats, Roads
 from sim2grid.clock.task import Task
 from sim2grid.clock.unfold import LOOK, Scouting, Unfolding
@@ -471,7 +471,7 @@ class TimedExecution:
                       > ASTRAY * self.asked.frame.cell_m]
             if astray:
                 self._break(j)
-                for i in astray:
+                for i in astray if not self.solved[j] else ():
                     self._send(i, j, errands[i].place)
             elif now >= errands[team[0]].until - 1e-6:
                 self._solve(j, team)
@@ -515,6 +515,9 @@ class TimedExecution:
             if errand.phase == "serving" and errand.choice == target:
                 errand.phase = "there"
         self.ask()
+        lapses = self.task.targets[target].lapses
+        if lapses is not None and self.book.time > lapses + LATE_S:
+            self.let_go(target)
 
     def _end_if_over(self) -> None:
         """Ends the mission when everything is done, or its time is."""

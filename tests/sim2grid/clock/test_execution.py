@@ -8,6 +8,7 @@ import pytest
 from moonteam.planners.seconds.base import NEVER
 from sim2grid.clock import steer
 from sim2grid.clock.roads import OpenGround, Straight
+from sim2grid.measure.metrics import target_reports
 
 ROVER = {"name": "rover", "kind": "wheeled", "skills": ["A"], "start": [0, 0]}
 WALKER = {"name": "walker", "kind": "legged", "skills": ["B"], "start": [0, 6]}
@@ -68,6 +69,35 @@ def test_what_has_lapsed_ends_the_mission(mission, drive):
     assert not done.record.success
     assert done.record.failure == "unsolvable"
     assert "T1" in done.record.detail
+
+
+WORTH = [{"at": [9, 9], "skills": ["A"], "lapses": 10, "worth": 3},
+         {"at": [4, 0], "skills": ["A"], "lapses": 60, "worth": 2, "service": 5}]
+
+
+def test_what_is_worth_something_may_lapse_and_the_mission_goes_on(mission, drive):
+    spec = mission([ROVER], WORTH)
+    done = drive(spec, (0, (0,)), spare=(1, (0,)))
+    assert done.record.success
+    assert done.record.lapsed == [0]
+    assert [solve.target for solve in done.record.solves] == [1]
+    assert ("lapsed" in [cause for _, cause in done.record.replans])
+    lapsed = [d for d in done.record.decisions if d.solved[0]]
+    assert lapsed[0].time_s == pytest.approx(10, abs=2 * LOOK)
+    reports = target_reports(done.record, spec)
+    assert [(t.worth, t.solved) for t in reports] == [(3, False), (2, True)]
+
+
+def test_a_service_under_way_does_not_lapse_but_one_broken_off_does(mission, drive):
+    spec = mission([ROVER], [{"at": [3, 0], "skills": ["A"], "service": 10, "lapses": 7,
+                              "worth": 1}])
+    done = drive(spec, (0, (0,)))
+    assert [solve.target for solve in done.record.solves] == [0]
+    assert not done.record.lapsed
+    away = drive(spec, (0, (0,)), faults={(0, 9.0): ("drift", 0.5, 0.0)})
+    assert away.record.success
+    assert away.record.lapsed == [0]
+    assert not away.record.solves
 
 
 def test_a_mission_ends_when_everybody_is_home(mission, drive):

@@ -211,7 +211,7 @@ def test_missions_go_round_sites_as_each_site_alone_has_them():
         assert all((mixed.site_of(k).heights == alone.site.heights).all() for k in rows)
 
 
-@pytest.mark.parametrize("unfold", ["following", "arrivals", "hidden", "losses"])
+@pytest.mark.parametrize("unfold", ["following", "arrivals", "lapsing", "hidden", "losses"])
 def test_missions_that_unfold_say_what_will_happen_and_what_may_be_expected(unfold):
     recipe = replace(RECIPE, unfold=unfold)
     first, second = (make_fleet(recipe, 4).missions for _ in range(2))
@@ -236,6 +236,11 @@ def test_missions_that_unfold_say_what_will_happen_and_what_may_be_expected(unfo
             assert len({event.target.at for event in come} | {t.at for t in mission.targets}) == 8
         if unfold == "following":
             assert [event.at_solved for event in come] == [1, 2, 3, 4, 5]
+        if unfold == "lapsing":
+            assert all(1 <= event.target.worth <= 5 for event in come)
+            assert all(15 <= event.target.lapses - event.at_s <= 40 for event in come)
+            assert not any(target.worth for target in mission.targets)
+            assert mission.expects.worth == (1.0, 5.0)
         if unfold == "arrivals":
             times = [event.at_s for event in come]
             assert times == sorted(times)
