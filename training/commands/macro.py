@@ -154,7 +154,7 @@ def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
     from moonteam.policies import pointer
 
     spec, params = _mean(args.policy)
-    sees = {key: True for key in ("unfolds", "worths") if getattr(args.config.spec, key)}
+    sees = {key: True for key in ("unfolds", "worths", "posts") if getattr(args.config.spec, key)}
     spec = dataclasses.replace(spec, **sees)
     params = pointer.grafted(spec, params)
     if args.config.spec.layers > spec.layers:

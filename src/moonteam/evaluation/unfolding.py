@@ -38,6 +38,7 @@ from moonteam.planners.unfolding.make import (
     decider_of,
     pointing,
     searching,
+    stands,
 )
 from moonteam.planners.unfolding.state import Outcome
 from moonteam.planners.unfolding.world import World
@@ -100,7 +101,8 @@ class Row:
         return self.ahead or (self.contender.together and not self.futures)
 
     def _replanning(self) -> Replanning:
-        return Replanning(self.planner, searching(self.pattern), self.pattern == PLACES)
+        return Replanning(self.planner, searching(self.pattern), self.pattern == PLACES,
+                          posts=stands(self.planner))
 
     def decider(self, number: int, seed: int) -> Decider:
         """Who decides in mission `number`."""

@@ -45,6 +45,8 @@ class PointerSpec:
 
     worths: bool = False
     """Sees what it counts to serve each target, where targets may lapse."""
+    posts: bool = False
+    """May send who has nothing to do to one of a few places to wait at."""
 
     def check(self, source: object) -> None:
         """Raises InputError if the numbers make no network."""
@@ -88,7 +90,7 @@ def look(state: MacroState, preference: Array) -> Outlook:
     lacks = world.missing(p, state.goal)
     incomplete = jnp.any(lacks > 0, axis=1)
     shown = world.known(state)
-    open_ = world.open_targets(state) & incomplete
+    open_ = world.open_targets(state) & (incomplete | world.posts(p))
     bound = state.goal < targets
     here = jnp.minimum(state.goal, targets - 1)
     legs = world.legs(p, state.node)

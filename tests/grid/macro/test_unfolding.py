@@ -132,3 +132,57 @@ def test_the_mean_way_to_what_comes_is_the_same_in_both_worlds():
     np.testing.assert_allclose(problem_of(now).middle_now, mean, atol=2e-3)
     # Where nothing is to come, nothing is said of it.
     assert problem_of(moment(mission)).middle_now.tolist() == [0.0, 0.0, 0.0]
+
+
+POSTS = draw.Draw(agents=(2, 3), targets=(6, 6), metric="straight", arriving=4, every=6.0,
+                  limit=300.0, worth=(1.0, 5.0), posts=True)
+
+
+def test_whatever_is_chosen_missions_with_posts_end_and_posts_are_never_served():
+    made = jax.vmap(partial(draw.draw, POSTS))(jax.random.split(jax.random.key(0), 64))
+    post = np.asarray(jax.vmap(world.posts)(made))
+    assert (post.sum(1) == draw.POSTS).all()
+    assert not np.asarray(made.worth)[post].any()
+
+    @jax.jit
+    def turn(states, over, key):
+        logits = jax.random.normal(key, (64, 3, POSTS.entries + 1))
+        logits = logits.at[..., 6:POSTS.entries].add(2.0)  # rather to posts
+        choice, options = jax.vmap(world.choose)(states, logits, jnp.zeros_like(logits))
+        result = jax.vmap(world.step)(states, choice)
+        after = jax.vmap(world.loosen)(result.state, jnp.ones(choice.shape, bool))
+        return jax.tree.map(lambda a, b: jnp.where(over.reshape(-1, *[1] * (a.ndim - 1)), a, b),
+                            (states, over), (after, result.terminated)), (
+            choice, options, result.truncated & ~over)
+
+    states, over = jax.vmap(world.reset)(made), jnp.zeros(64, bool)
+    went = 0
+    for k in range(120):
+        before = states
+        (states, over), (choice, options, truncated) = turn(states, over, jax.random.key(k))
+        assert not truncated.any()
+        posts = options[..., 6:POSTS.entries].any((1, 2)) & ~over
+        assert (np.asarray(jax.vmap(world.coming)(before))[np.asarray(posts)] > 0).all()
+        went += int((np.asarray(choice) >= 6).sum() - (np.asarray(choice) == POSTS.entries).sum())
+    assert np.asarray(over).all()
+    assert went > 200
+    assert not np.asarray(states.solved)[post].any()
+
+
+def test_who_waits_at_a_post_is_free_on_the_way_and_there():
+    made = draw.draw(POSTS, jax.random.key(3))
+    state = world.reset(made)
+    post = int(np.argmax(np.asarray(world.posts(made))))
+    far = np.asarray(world.legs(made, state.node))[:, post]
+    other = POSTS.entries
+    goal = np.full(len(far), other, np.int32)
+    goal[0] = post
+    after = world.step(state, goal).state
+    passed = float(after.now - state.now)
+    if passed < far[0] - 1e-3:  # something happened on its way
+        assert not bool(world.free(after)[0])
+        after = world.loosen(after, jnp.ones(len(far), bool))
+        left = np.asarray(world.legs(after.problem, after.node))[0, post]
+        np.testing.assert_allclose(left, far[0] - passed, atol=2e-3)
+    assert bool(world.free(after)[0])
+    assert not bool(after.solved[post])

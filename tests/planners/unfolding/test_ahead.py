@@ -17,9 +17,10 @@ from moonteam.planners.seconds.macro import problem_of
 from moonteam.planners.unfolding.ahead import LookingAhead, imagined, of_the_known, raced, sure
 from moonteam.planners.unfolding.deciders import Replanning, play, play_together
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.pointing import Pointing
-from moonteam.planners.unfolding.search import with_looks
+from moonteam.planners.unfolding.pointing import Pointing, problem_in
+from moonteam.planners.unfolding.search import with_looks, without_posts
 from moonteam.planners.unfolding.world import World
+from moonteam.policies.pointer import grafted
 from moonteam.policies.policy import Policy
 from moonteam.problem import timed
 from moonteam.problem.timed import Agent, Loss, Prospect, Target, Timed
@@ -53,11 +54,12 @@ def test_the_best_try_is_done_if_it_gains_more_than_its_error_and_the_worse_drop
     assert stays.all()
 
 
-@pytest.mark.parametrize(("name", "events"), [("following", 3), ("arrivals", 2), ("arrivals", 6)])
+@pytest.mark.parametrize(("name", "events"), [("following", 3), ("arrivals", 2), ("arrivals", 6),
+                                            ("lapsing", 5)])
 def test_an_imagined_mission_is_the_one_in_which_that_future_was_known(name, events):
     view = later(missions(name, 3)[2], events)
     drawn = [future(view, np.random.default_rng(k)) for k in range(3)]
-    size = 12
+    size = 14
     problems = imagined(view, drawn, size)
     left = np.flatnonzero(~view.moment.solved)
     for row, one in enumerate(drawn):
@@ -70,12 +72,14 @@ def test_an_imagined_mission_is_the_one_in_which_that_future_was_known(name, eve
         np.testing.assert_allclose(own.start[:, :count], whole.start[:, rows], **near)
         np.testing.assert_allclose(own.between[:, :count, :count],
                                    whole.between[:, rows][:, :, rows], **near)
-        for key in ("need", "either", "service", "lapses"):
+        for key in ("need", "either", "service", "worth"):
             np.testing.assert_array_equal(getattr(own, key)[:count], getattr(whole, key)[rows])
+        np.testing.assert_allclose(own.lapses[:count], whole.lapses[rows], **near)
         np.testing.assert_array_equal(own.has, whole.has)
         assert own.unit == pytest.approx(float(whole.unit), rel=1e-3)
-        late = own.shown[len(left):count] if name == "arrivals" else own.following[len(left):count]
-        expected = [t.appears - view.now / 1000 for t in one.coming] if name == "arrivals" else (
+        timed_ = name != "following"
+        late = (own.shown if timed_ else own.following)[len(left):count]
+        expected = [t.appears - view.now / 1000 for t in one.coming] if timed_ else (
             np.arange(view.coming) + 1)
         np.testing.assert_allclose(late, expected, atol=1e-3)
 
@@ -125,7 +129,7 @@ def test_nobody_waits_for_a_place_to_look_from():
     served[0, :len(view.targets)], served[0, len(view.targets):first] = 3.0, 1000.0
     served[0, first:first + view.coming] = 5.0
     total = 3.0 * len(view.targets) + 5.0 * view.coming
-    assert ahead._cost(asked, np.ones(1), served).tolist() == [total]
+    assert ahead._cost(asked, np.ones(1), served, np.zeros(1)).tolist() == [total]
 
 
 @pytest.mark.soak
@@ -236,3 +240,40 @@ def test_ways_to_places_are_each_robots_own_whatever_the_classes():
     by_speed, by_robot = (with_looks(replace(view, moment=m)).moment for m in (usual, ground))
     np.testing.assert_array_equal(by_robot.between, by_speed.between[by_speed.classes])
     assert by_robot.between[0].max() < by_robot.between[1].max()
+
+
+def test_who_has_nothing_to_do_may_be_sent_to_a_place_to_wait_at():
+    """Shown beside the targets; not planned for, and turned into a place."""
+    world = World(missions("lapsing", 1)[0])
+    deciding = Replanning(ExactPlanner(), posts=True)
+    view = deciding.shown(world.view())
+    count = len(view.targets)
+    assert [look.at for look in view.looks] == [
+        (15.5, 15.5), (7.75, 7.75), (23.25, 7.75), (7.75, 23.25), (23.25, 23.25)]
+    assert not view.moment.need[count:].any()
+    bare = without_posts(view)
+    assert bare.solved[count:].all()
+    plan, known = of_the_known(bare), of_the_known(world.view().moment)
+    assert plan.tolist() == known.tolist()
+    problem = problem_in(view)
+    assert np.asarray(macro_world.posts(problem)).tolist() == [False] * count + [True] * 5
+    orders = deciding.settled(view, np.array([count, count + 2, -1]))
+    assert orders[:2] == [(15.5, 15.5), (23.25, 7.75)]
+    world.step(orders)
+    assert world.state.bodies[0].phase in ("going", "there")
+    # Nothing is shown once nothing more comes.
+    while world.view().coming:
+        world.step([-1] * 3)
+    assert not deciding.shown(world.view()).looks
+
+
+def test_a_policy_that_waits_somewhere_looks_ahead_from_there():
+    spec = replace(POLICY.brain.spec, unfolds=True, worths=True, posts=True)
+    policy = replace(POLICY, params=grafted(spec, POLICY.params),
+                     brain=replace(POLICY.brain, spec=spec))
+    deciding = Replanning(ExactPlanner(), posts=True)
+    view = deciding.shown(later(missions("lapsing", 1)[0], 2))
+    (chosen,) = LookingAhead(policy, 4).choose([view])
+    assert ((chosen == -1) | ((chosen >= 0) & (chosen < len(view.moment.solved)))).all()
+    again = LookingAhead(policy, 4).choose([view])[0]
+    assert chosen.tolist() == again.tolist()

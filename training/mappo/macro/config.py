@@ -220,10 +220,10 @@ PRESETS = {
         "lapsing", (
             Practice("2 + 10 by a clock, each lapses",
                      Draw(targets=(12, 12), metric="straight", speeds=(1.5, 0.36, 0.47),
-                          arriving=10, every=8.0, limit=300.0, worth=(1.0, 5.0))),
+                          arriving=10, every=8.0, limit=300.0, worth=(1.0, 5.0), posts=True)),
         ),
-        rounds=300, hyper=replace(HYPER, vf_coef=0.05), vine=Vine(tau=0.5),
-        spec=PointerSpec(unfolds=True, worths=True), lr=5e-4),
+        rounds=200, hyper=replace(HYPER, vf_coef=0.05), vine=Vine(tau=0.15),
+        spec=PointerSpec(unfolds=True, worths=True, posts=True), lr=5e-4),
     "searching": MacroConfig(
         "searching", (
             Practice("5 hidden targets", Draw(

@@ -122,6 +122,8 @@ class Draw:
     """Least and most that it counts to serve a target; 0: all have to be served."""
     stays: tuple[float, float] = (15.0, 40.0)
     """Fewest and most s until a target that is worth something lapses."""
+    posts: bool = False
+    """Whether there are places to wait at (`post_places`)."""
     looks: int = 0
     """Where every target is hidden: places from which robots look, so many along either side."""
     sensor: float = 6.0
@@ -134,14 +136,15 @@ class Draw:
 
     @property
     def entries(self) -> int:
-        """M, the most targets and all places to look from."""
-        return self.targets[1] + self.looks**2
+        """M, the most targets and all places to look from, or to wait at."""
+        return self.targets[1] + self.looks**2 + (POSTS if self.posts else 0)
 
     @property
     def turns(self) -> int:
         """Decisions after which an episode should have ended."""
         # Those of a crew go together; what lapses is an event too.
-        return (4 if self.crews[1] > 1 else 3 if self.worth[1] else 2) * self.entries
+        each = 4 if self.crews[1] > 1 else 3 if self.worth[1] else 2
+        return each * (self.targets[1] + self.looks**2)
 
     @property
     def config(self) -> EnvConfig:
@@ -162,6 +165,8 @@ def draw(family: Draw, key: Array) -> MacroProblem:
         problem, cells = in_crews(family, problem, cells, jax.random.fold_in(more, 2))
     if family.looks:
         problem, skills = looked_for(family, problem), skills + 1
+    if family.posts:
+        problem = with_entries(problem, post_places(jnp.zeros(2), problem.size - 1.0), 0)
     if family.metric == "either":
         made = [of_grid(problem, cells, family.limit, metric, speed, skills)
                 for metric in ("manhattan", "straight")]
@@ -190,13 +195,17 @@ def in_crews(family: Draw, problem: Problem, cells: Array, key: Array) -> tuple[
 
 def looked_for(family: Draw, problem: Problem) -> Problem:
     """The problem with the places to look from after its targets, and eyes as one more skill."""
+    eyes = 1 << family.num_skills
     spots = places(jnp.zeros(2), problem.size - 1.0, family.looks)
-    count, eyes = len(spots), 1 << family.num_skills
-    join = lambda a, b: jnp.concatenate([a, jnp.broadcast_to(b, (count, *a.shape[1:]))])
+    return replace(with_entries(problem, spots, eyes), agent_skills=problem.agent_skills | eyes)
+
+
+def with_entries(problem: Problem, spots: Array, skills: int) -> Problem:
+    """The problem with these places [P, 2] after its targets, which need all of `skills`."""
+    join = lambda a, b: jnp.concatenate([a, jnp.broadcast_to(b, (len(spots), *a.shape[1:]))])
     return replace(
-        problem, agent_skills=problem.agent_skills | eyes,
-        target_cells=jnp.concatenate([problem.target_cells.astype(jnp.float32), spots]),
-        target_skills=join(problem.target_skills, jnp.int32(eyes)),
+        problem, target_cells=jnp.concatenate([problem.target_cells.astype(jnp.float32), spots]),
+        target_skills=join(problem.target_skills, jnp.int32(skills)),
         target_and=join(problem.target_and, jnp.array(True)),
         target_mask=join(problem.target_mask, jnp.array(True)))
 
@@ -205,9 +214,11 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
               key: Array) -> MacroProblem:
     """The problem, its last targets to follow on others or to arrive by a clock."""
     targets = made.start.shape[1]
-    count = jnp.sum(made.target_mask)
-    turn = jnp.arange(targets) - (count - max(family.following, family.arriving)) + 1
-    late = made.target_mask & (turn > 0)
+    real = made.target_mask & (jnp.arange(targets) < family.targets[1])
+    turn = jnp.arange(targets) - (jnp.sum(real) - max(family.following, family.arriving)) + 1
+    late = real & (turn > 0)
+    if family.posts:
+        made = replace(made, looks=jnp.arange(targets) >= family.entries - POSTS)
     if family.looks:
         made = hidden(family, made, problem, cells)
     elif family.following:
@@ -217,7 +228,7 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
         when = jnp.where(late, jnp.cumsum(jnp.where(late, gaps, 0.0)), 0.0)
         made = replace(made, appears=when, shown=when)
     if family.worth[1]:
-        made = lapsing(family, made, jax.random.fold_in(key, 1))
+        made = lapsing(family, made, real, jax.random.fold_in(key, 1))
     metric: Metric = "manhattan" if family.metric == "manhattan" else "straight"
     fastest = jnp.max(jnp.where(made.agent_mask, speed, 0.0))
     spots = places(jnp.zeros(2), problem.size - 1.0)
@@ -225,15 +236,16 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
     return replace(made, middle=mean(problem.target_cells), middle_now=mean(cells))
 
 
-def lapsing(family: Draw, made: MacroProblem, key: Array) -> MacroProblem:
-    """The problem, its targets worth something each, and lapsing after a while."""
+def lapsing(family: Draw, made: MacroProblem, real: Array, key: Array) -> MacroProblem:
+    """The problem, its `real` [M] targets worth something each, and lapsing after a while."""
     value, time = jax.random.split(key)
     targets = made.start.shape[1:]
     low, high = family.worth
     worth = jax.random.uniform(value, targets, minval=low, maxval=high)
     low, high = family.stays
     stays = jax.random.uniform(time, targets, minval=low, maxval=high)
-    return replace(made, worth=jnp.where(made.target_mask, worth, 0.0), lapses=made.shown + stays)
+    return replace(made, worth=jnp.where(real, worth, 0.0),
+                   lapses=jnp.where(real, made.shown + stays, FAR))
 
 
 def hidden(family: Draw, made: MacroProblem, problem: Problem, cells: Array) -> MacroProblem:
@@ -255,6 +267,16 @@ def places(low: Any, high: Any, along: int = 8) -> Any:
     share = (xp.arange(along) + 0.5) / along
     grid = xp.stack(xp.meshgrid(share, share), axis=-1).reshape(-1, 2)
     return low[None] + grid * (high - low)[None]
+
+
+POSTS = 5
+"""Places to wait at: the middle of the area, and those of its quarters."""
+
+
+def post_places(low: Any, high: Any) -> Any:
+    """[`POSTS`, 2] of a rectangle; of NumPy's arrays or JAX's, `low` and `high` [2]."""
+    xp = low.__array_namespace__()
+    return xp.concat([places(low, high, 1), places(low, high, 2)])
 
 
 def paces(family: Draw, key: Array) -> Array:

@@ -38,7 +38,7 @@ class MacroProblem:
     shown: Array  # [M] s before which nobody knows of j
     following: Array  # [M] int32, targets that are solved before anybody knows of j
     sight: Array  # [M, M] bool, sight[j, k]: j is hidden, and seen from k once k is solved
-    looks: Array  # [M] bool, places to look from, of use until all that is hidden has been seen
+    looks: Array  # [M] bool, of use while targets come: places to look from, or to wait at (posts)
     coming: Array  # [] int32, targets still to be known of that have no entry here
     middle: Array  # [M] s from j to where targets may come, in the mean; 0 where nobody can say
     middle_now: Array  # [N] the same from where each agent starts

@@ -6,6 +6,9 @@ and are the coalition that it needs, the targets before it have ended and it has
 `service` seconds later, and its agents are free again. Between events nothing is decided; at
 every event that leaves an agent free, all free agents choose, one after the other.
 
+Where targets may still come there may be posts, places to wait at: choosing one is to wait, on the
+way there and then there, free all the while to set out for a target.
+
 Choices that lead nowhere are not allowed (see `allowed`), so that no two agents wait for each
 other for ever, whatever a policy says. Legend as in `types`.
 """
@@ -20,6 +23,9 @@ from jax import Array
 
 from moonteam import trees
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroResult, MacroState
+
+NEAR = 0.5
+"""s to a post within which an agent is there."""
 
 SOON = 5e-4
 """s below which two events are one; tables are in whole milliseconds."""
@@ -77,6 +83,11 @@ def open_targets(state: MacroState) -> Array:
     return ~state.solved & ~state.serving & known(state) & ~moot
 
 
+def posts(problem: MacroProblem) -> Array:
+    """[M] bool: places to wait at, which nobody serves."""
+    return problem.looks & ~jnp.any(problem.need > 0, axis=1)
+
+
 def finished(state: MacroState) -> Array:
     """[] bool: every target is solved."""
     return jnp.all(state.solved | state.problem.looks)
@@ -128,7 +139,9 @@ def allowed(state: MacroState, goal: Array) -> Array:
 
 def anyone_coming(state: MacroState) -> Array:
     """[] bool: somebody is on the way, serves, or will be free; so something will happen."""
-    return jnp.any((state.busy > 0) & state.problem.agent_mask)
+    bound = jax.nn.one_hot(state.goal, state.solved.shape[0], dtype=bool)
+    waits = jnp.any(bound & posts(state.problem)[None], axis=1)
+    return jnp.any((state.busy > 0) & state.problem.agent_mask & ~waits)
 
 
 def with_waiting(may: Array, coming: Array) -> Array:
@@ -155,11 +168,14 @@ def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array
     """
     agents, targets = state.problem.start.shape
     everyone = jnp.arange(agents)
+    post = posts(state.problem)
+    stand = (open_targets(state) & post)[None] & (legs(state.problem, state.node) > NEAR)
 
     def turn(carry: tuple, _: None) -> tuple[tuple, None]:
         goal, choice, mask, todo, coming = carry
         may = allowed(state, goal) & todo[:, None]  # [N, M]
         options = with_waiting(may, coming)
+        options = options.at[:, :targets].set(may | (stand & todo[:, None] & options[:, targets:]))
         held = jnp.where(options, logits, -FAR)
         sure = jnp.max(jax.nn.log_softmax(held, axis=1), axis=1)
         # Who has no choice comes last, not to count as the surest.
@@ -171,7 +187,8 @@ def choose(state: MacroState, logits: Array, noise: Array) -> tuple[Array, Array
         choice = jnp.where(own, pick, choice)
         mask = jnp.where(own[:, None], options, mask)
         goal = jnp.where(own, pick, goal)
-        return (goal, choice, mask, todo & ~own, coming | (jnp.any(own) & (pick < targets))), None
+        goes = (pick < targets) & ~post[jnp.minimum(pick, targets - 1)]
+        return (goal, choice, mask, todo & ~own, coming | (jnp.any(own) & goes)), None
 
     alone = jnp.zeros((agents, targets + 1), bool).at[:, targets].set(True)
     none = jnp.full(agents, targets, jnp.int32)
@@ -278,12 +295,12 @@ def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
         return ~(finished(state) | dead | decide)
 
     def event(carry: tuple) -> tuple:
-        state, _, _, again = carry
-        later, dead = _advance(state)
+        state, _, moved, again = carry
+        later, dead, quiet = _advance(state)
         # A service without length sets its agents free at once, and what comes after it can start.
         state = jax.tree.map(lambda a, b: jnp.where(again, a, b), state, later)
         started, again_now = begun(state)
-        return started, dead & ~again, jnp.array(True), again_now
+        return started, dead & ~again, moved | again | ~quiet, again_now
 
     first, again = begun(state)
     start = first, jnp.array(False), moved | again, again
@@ -299,6 +316,7 @@ def _start(state: MacroState) -> MacroState:
     there = jnp.where(waiting, state.goal, targets)
     coming = jax.nn.one_hot(jnp.where(waiting, targets, state.goal), targets, dtype=bool)
     met = jnp.all(missing(problem, there) == 0, axis=1) & ~jnp.any(coming, axis=0)
+    met = met & ~posts(problem)
     before = jnp.all(~problem.after | state.solved[None], axis=1)
     window = (state.now >= problem.appears - SOON) & (state.now <= problem.lapses + SOON)
     # Who has come to look does so, of use or not.
@@ -314,12 +332,15 @@ def _start(state: MacroState) -> MacroState:
         served=jnp.where(starts, state.now, state.served))
 
 
-def _advance(state: MacroState) -> tuple[MacroState, Array]:
-    """To the next event; and whether there is none, or none before the limit."""
+def _advance(state: MacroState) -> tuple[MacroState, Array, Array]:
+    """To the next event; whether there is none, or none before the limit; and whether it is only
+    that somebody came to a post.
+    """
     problem = state.problem
     targets = problem.start.shape[1]
     arrivals = jnp.where((state.busy > 0) & problem.agent_mask, state.busy, FAR)
     here = jnp.minimum(state.goal, targets - 1)
+    stands = (state.goal < targets) & posts(problem)[here]
     waiting = (state.goal < targets) & (state.busy <= 0)
     opens = problem.appears[here] - state.now
     opens = jnp.where(waiting & (opens > 0), opens, FAR)
@@ -330,8 +351,12 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     optional, pending = problem.worth > 0, ~state.solved & ~state.serving
     ends = problem.lapses - state.now + 2 * SOON
     ends = jnp.where(optional & pending & (problem.lapses < FAR / 2), jnp.maximum(ends, 0.0), FAR)
-    wait = jnp.minimum(jnp.minimum(jnp.min(arrivals), jnp.min(opens)),
+    rest = jnp.min(jnp.where(stands, FAR, arrivals))
+    wait = jnp.minimum(jnp.minimum(rest, jnp.min(opens)),
                        jnp.minimum(jnp.min(news), jnp.minimum(jnp.min(losses), jnp.min(ends))))
+    there = jnp.min(jnp.where(stands, arrivals, FAR))
+    quiet = there < wait - SOON
+    wait = jnp.minimum(wait, there)
     late = pending & ~optional & (state.now > problem.lapses + SOON)
     dead = (wait >= FAR / 2) | jnp.any(late)
     left = jnp.maximum(problem.limit - state.now, 0.0)
@@ -348,13 +373,13 @@ def _advance(state: MacroState) -> tuple[MacroState, Array]:
     released = (state.busy > 0) & (busy <= 0) & ~bound  # of those that could not yet set out
     lapses = optional & pending & (now > problem.lapses + SOON)
     lapsed = state.lapsed | lapses
-    vain = bound & (busy <= 0) & lapsed[here]  # waited there
+    vain = bound & (busy <= 0) & (lapsed[here] | stands)  # waits for nothing there
     after = replace(
         state, now=now, busy=busy, serving=state.serving & ~ended,
         solved=state.solved | ended | lapses, lapsed=lapsed,
         goal=jnp.where(finished | vain, targets, state.goal),
         since=jnp.where(finished | released | vain, now, state.since))
-    return _without_lost(loosen(after, bound & lapsed[here])), dead
+    return _without_lost(loosen(after, bound & lapsed[here])), dead, quiet
 
 
 def _without_lost(state: MacroState) -> MacroState:

@@ -16,7 +16,7 @@ from moonteam.planners.seconds.base import MS, TimedPlanner
 from moonteam.planners.seconds.keeper import HOME, Keeper, choices, order_of
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.ground import INSIDE
-from moonteam.planners.unfolding.search import Pattern, with_looks
+from moonteam.planners.unfolding.search import Pattern, with_looks, with_posts
 from moonteam.planners.unfolding.state import Order
 from moonteam.planners.unfolding.world import View, World
 
@@ -55,12 +55,13 @@ class Replanning:
 
     A plan is kept until another is better, by `margin_ms`. Robots that it has nothing for go home,
     or look for hidden targets by the pattern; or, with `places`, places to look from are planned
-    for as if they were targets.
+    for as if they were targets. A policy may be shown places to wait at beside them (`posts`).
     """
 
     def __init__(self, planner: TimedPlanner, pattern: Pattern | None = None,
-                 places: bool = False, margin_ms: int = 0):
+                 places: bool = False, margin_ms: int = 0, posts: bool = False):
         self._planner, self._pattern, self._places = planner, pattern, places
+        self._posts = posts
         self._keeper = Keeper(planner, margin_ms)
 
     def act(self, view: View) -> list[Order]:
@@ -74,8 +75,11 @@ class Replanning:
         return self.settled(view, self._keeper.act(view.moment))
 
     def shown(self, view: View) -> View:
-        """What is planned for: with the places to look from, where these count as targets."""
-        return with_looks(view) if self._places else view
+        """What is planned for: with the places to look from, where these count as targets, or to
+        wait at.
+        """
+        shown = with_looks(view) if self._places else view
+        return with_posts(shown) if self._posts else shown
 
     def settled(self, view: View, chosen: np.ndarray) -> list[Order]:
         """The choices [N], those who have none looking for what is hidden."""

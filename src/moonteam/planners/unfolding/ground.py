@@ -42,6 +42,15 @@ class Look:
         return float(x), float(y)
 
 
+class Post(Look):
+    """A place to wait at, of the same kind in what is shown of a mission."""
+
+    def from_afar(self, here: Floats, reach: float) -> Place:
+        """The place itself."""
+        del here, reach
+        return self.at
+
+
 @dataclass
 class Ground:
     """Points, and which of them have been seen."""

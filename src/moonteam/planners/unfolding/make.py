@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from moonteam.errors import InputError
+from moonteam.planners import macro
 from moonteam.planners.seconds.base import TimedPlanner
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.keeper import HOME
@@ -70,6 +71,11 @@ def pointing(planner: TimedPlanner) -> Choose | None:
     return None
 
 
+def stands(planner: TimedPlanner) -> bool:
+    """Whether it is a policy that may send who has nothing to do to a place to wait at."""
+    return isinstance(planner, PolicyPlanner) and macro.spec_of(planner.policy).posts
+
+
 def searching(search: str, near_m: float = NEAR_M) -> Pattern | None:
     """A fresh pattern, for it remembers its mission; None of `PLACES` and where none is."""
     made: dict[str, Pattern] = {
@@ -93,7 +99,7 @@ def decider_of(planner: TimedPlanner, *, search: str = "", futures: int = 0,
       near_m: m at which a robot is where it was to look from.
     """
     pattern, choose = searching(search, near_m), pointing(planner)
-    replanning = Replanning(planner, pattern, search == PLACES, margin_ms)
+    replanning = Replanning(planner, pattern, search == PLACES, margin_ms, stands(planner))
     if futures and certain and isinstance(planner, PolicyPlanner) and search in ALL_AT_ONCE:
         return Choosing(LookingAhead(planner.policy, futures, goal, seed,
                                      planner.preference).choose, replanning)

@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
-from moonteam.grid.macro.draw import places
-from moonteam.planners.seconds.base import NEVER
-from moonteam.planners.unfolding.ground import INSIDE
+from moonteam.grid.macro.draw import places, post_places
+from moonteam.planners.seconds.base import NEVER, Moment
+from moonteam.planners.unfolding.ground import INSIDE, Look, Post
 from moonteam.planners.unfolding.state import distances, ms
 from moonteam.planners.unfolding.world import View
 from moonteam.problem.timed import Place
@@ -155,18 +155,45 @@ def with_looks(view: View) -> View:
     reach = [INSIDE * agent.sensor for agent in view.agents if agent.sensor is not None]
     if view.ground is None or not view.coming or not reach:
         return view
-    looks, now, metric = view.ground.looks(min(reach)), view.moment, view.state.problem.metric
+    eyes = np.array([agent.sensor is not None for agent in view.agents])
+    return _with_columns(view, view.ground.looks(min(reach)), eyes)
+
+
+def with_posts(view: View) -> View:
+    """What is known, with a column in `moment` for each place to wait at, the last ones: as if it
+    were a target that needs nobody.
+
+    Without any where nothing is to come, nobody knows where, or there are places to look from.
+    """
+    area = view.expects.area
+    if not view.coming or area is None or view.looks:
+        return view
+    spots = post_places(np.array(area[:2]), np.array(area[2:])).tolist()
+    nobody = np.zeros(len(view.agents), bool)
+    return _with_columns(view, [Post((x, y), np.zeros((0, 2))) for x, y in spots], nobody)
+
+
+def without_posts(view: View) -> Moment:
+    """What there is to plan for: `moment`, its posts neither open nor of use."""
+    posts = [len(view.targets) + k for k, look in enumerate(view.looks) if isinstance(look, Post)]
+    return view.moment.without(np.array(posts, np.int64)) if posts else view.moment
+
+
+def _with_columns(view: View, looks: Sequence[Look], able: np.ndarray) -> View:
+    """The view with these places, each of which needs one of those who are `able` [N] bool, if any
+    are.
+    """
+    now, metric = view.moment, view.state.problem.metric
     more, targets = len(looks), len(view.targets)
     places = np.array([look.at for look in looks], float).reshape(-1, 2)
     spots = np.concatenate([np.array([t.at for t in view.targets], float).reshape(-1, 2), places])
     speeds = np.array([agent.speed for agent in view.agents])
-    eyes = np.array([agent.sensor is not None for agent in view.agents])
     far = distances(spots, spots, metric)
     of_class = [speeds[now.classes == c][0] for c in range(len(now.between))]
     between = np.stack([ms(far, speed) for speed in of_class])
     between[:, :targets, :targets] = now.between
     need = np.zeros((targets + more, now.need.shape[1] + 1), np.int64)
-    need[:targets, :-1], need[targets:, -1] = now.need, 1
+    need[:targets, :-1], need[targets:, -1] = now.need, able.any()
     after = np.zeros((targets + more,) * 2, bool)
     after[:targets, :targets] = now.after
 
@@ -177,10 +204,10 @@ def with_looks(view: View) -> View:
     moment = replace(
         now, start=np.concatenate([now.start, start], 1), between=between,
         home=np.concatenate([now.home, np.zeros_like(start)], 1),
-        has=np.concatenate([now.has, eyes[:, None]], 1), need=need, either=longer(now.either),
+        has=np.concatenate([now.has, able[:, None]], 1), need=need, either=longer(now.either),
         service=longer(now.service), after=after, appears=longer(now.appears),
         lapses=longer(now.lapses, NEVER), solved=longer(now.solved), ends=longer(now.ends),
-        middle=view.state.middle(spots))
+        middle=view.state.middle(spots), worth=None if now.worth is None else longer(now.worth))
     return replace(view, moment=moment, looks=tuple(looks))
 
 
