@@ -85,7 +85,8 @@ class HeldOut:
             if self.family.draw.worth[1]:
                 served = self.problems.worth.sum(1) - missed
                 return {"family": self.family.name, "success": float(solved.mean()),
-                        "makespan_gap": float(self.best.mean() / served.mean() - 1.0)}
+                        "makespan_gap": float(self.best.mean() / served.mean() - 1.0),
+                        "worth_served": float(served.sum() / self.problems.worth.sum())}
         else:
             done = rollouts(policy, self.problems)
             solved, took = done.solved[:, 0], done.seconds[:, 0]

@@ -239,8 +239,11 @@ class MacroMappo:
 
     def lines(self, report: dict[str, Any]) -> list[str]:
         """A line a family."""
-        return [*(f"{row['family']}: success {row['success']:.3f}, makespan "
-                  f"{row['makespan_gap']:.1%} over the optimum" for row in report["families"]),
+        return [*(f"{row['family']}: success {row['success']:.3f}, " + (
+                      f"{row['worth_served']:.1%} of the worth served, hindsight "
+                      f"{row['makespan_gap']:.1%} more" if "worth_served" in row else
+                      f"makespan {row['makespan_gap']:.1%} over the optimum")
+                  for row in report["families"]),
                 f"{report['env_steps']:,} moments in {report['seconds']:.0f} s"]
 
     def draw_curve(self, path: Path, rows: list[Row]) -> None:

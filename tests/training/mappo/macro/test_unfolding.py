@@ -85,6 +85,11 @@ def test_where_targets_lapse_it_is_judged_by_the_worth_that_it_serves():
     served = p.worth.sum(1) - missed
     assert 0 < missed.mean() < p.worth.sum(1).mean()
     assert (served <= held.best + 1e-3).all(), "nobody serves more than hindsight"
+    trainee = MacroMappo(dataclasses.replace(TINY, families=(Practice("one", LAPSING),),
+                                             spec=WORTHS))
+    score = {"family": "one", "success": 1.0, "makespan_gap": 0.25, "worth_served": 0.6}
+    said = trainee.lines({"families": [score], "env_steps": 1, "seconds": 1.0})[0]
+    assert said == "one: success 1.000, 60.0% of the worth served, hindsight 25.0% more"
 
 
 def test_a_network_that_comes_to_see_worth_begins_as_the_same_and_learns_by_it():
