@@ -79,6 +79,26 @@ def test_a_problem_by_the_clock_is_planned(capsys):
     assert plan["makespan"] == printed(capsys, "plan", "3x5:0")["makespan"]
 
 
+def test_what_is_left_out_is_said(tmp_path, capsys):
+    file = tmp_path / "mission.yaml"
+    file.write_text("""
+clock: seconds
+map: {size: [32, 32]}
+robots: [{name: rover, kind: wheeled, skills: [drill], start: [6, 4]}]
+targets:
+  - {name: core, at: [12, 6], skills: [drill]}
+  - {name: far, at: [30, 30], skills: [drill], lapses: 15, worth: 3}
+  - {name: near, at: [9, 5], skills: [drill], lapses: 40, worth: 1}
+""")
+    plan = printed(capsys, "plan", str(file))
+    assert (plan["left_out"], plan["worth"], plan["offered"]) == ([1], 1.0, 4.0)
+    assert {one["target"] for one in plan["schedule"]} == {0, 2}
+    assert main(["plan", str(file)]) == 0
+    said = capsys.readouterr().out
+    assert "serves a worth of 1 of 4; left out: far" in said
+    assert "no plan serves more worth" in said
+
+
 def test_no_robot_is_faster_than_its_kind(tiny, capsys, tmp_path):
     file = tmp_path / "fast.yaml"
     file.write_text(TINY.replace("start: [5, 1]", "start: [5, 1], speed: 3"))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from moonteam import compilation, files
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import MS, Moment, TimedPlan, moment, timed_again
+from moonteam.planners.seconds.leaving import served
 from moonteam.problem.mission import Mission
 from moonteam.problem.timed import Metric, Timed, distance
 
@@ -107,6 +108,9 @@ def document(case: Case, plan: TimedPlan) -> dict[str, Any]:
         "effort": None if plan.effort is None else plan.effort / MS,
         "bound": None if plan.bound is None else plan.bound / MS, "seconds": plan.seconds,
         "schedule": schedule}
+    if plan.status != "infeasible" and len(case.now.optional):
+        left, worth, offered = left_out(case.now, plan)
+        out |= {"left_out": left, "worth": worth, "offered": offered}
     if case.ground is not None and plan.status != "infeasible":
         out["ways"] = [[{"target": None if one is None else one.target,
                          "points": np.round(points, 3).tolist(), "leaves": leaves,
@@ -114,6 +118,13 @@ def document(case: Case, plan: TimedPlan) -> dict[str, Any]:
                         for one, points, leaves, arrives in ways_of(case, plan, i)]
                        for i in range(len(case.agents))]
     return out | ({"reason": plan.reason} if plan.reason else {})
+
+
+def left_out(now: Moment, plan: TimedPlan) -> tuple[list[int], float, float]:
+    """Targets that a plan does not serve, the worth of those that it does, and of all there is."""
+    left = set(now.optional.tolist()) - {one.target for one in plan.services}
+    assert now.worth is not None
+    return sorted(left), served(now, plan.services), float(now.worth[now.optional].sum())
 
 
 def ways_of(case: Case, plan: TimedPlan, agent: int) -> list[tuple[Any, Floats, float, float]]:
@@ -161,6 +172,11 @@ def show(case: Case, plan: TimedPlan) -> None:
     assert plan.effort is not None
     console.print(f"makespan {plan.makespan / MS:.1f} {unit}, {plan.effort / MS:.1f} {unit} of "
                   "travel in all", soft_wrap=True, highlight=False)
+    if len(case.now.optional):
+        left, worth, offered = left_out(case.now, plan)
+        names = ", ".join(case.targets[j] for j in left) or "nothing"
+        console.print(f"serves a worth of {worth:g} of {offered:g}; left out: {names}",
+                      soft_wrap=True, highlight=False)
     console.print(verdict(case, plan), soft_wrap=True, highlight=False)
     if plan.reason:
         console.print(f"{plan.planner}: {plan.reason}", soft_wrap=True, highlight=False)
@@ -170,6 +186,9 @@ def verdict(case: Case, plan: TimedPlan) -> str:
     """What the plan's status means, in words."""
     where = "in seconds on this ground" if case.ground is not None else "by the clock"
     assert plan.makespan is not None
+    if plan.status == "optimal" and len(case.now.optional):
+        return f"optimal {where}, {plan.makespan / MS:.1f} {case.unit}: proved that no plan " \
+               f"serves more worth, or as much with less {plan.objective}"
     if plan.status == "optimal":
         return f"optimal {where}, {plan.makespan / MS:.1f} {case.unit}: proved that no plan has " \
                f"less {plan.objective}"
