@@ -66,7 +66,7 @@ def test_the_file_takes_any_team_and_any_skills(path):
     policy = Policy.load(path)
     session = onnxruntime.InferenceSession(model_of(policy))
     assert {one.name for one in session.get_inputs()} == {
-        field.name for field in dataclasses.fields(Outlook)} - {"ahead"}
+        field.name for field in dataclasses.fields(Outlook)} - {"ahead", "worth"}
     rng, point = np.random.default_rng(1), jax.jit(pointer.point, static_argnums=1)
     for batch, agents, targets, skills in ((1, 1, 1, 1), (3, 4, 7, 5), (2, 9, 20, 8)):
         view = outlook(rng, batch, agents, targets, skills)
@@ -131,7 +131,7 @@ def test_numpy_alone_builds_what_the_network_sees_and_settles_choices_alike(kind
         for e in np.flatnonzero(going).tolist():
             own = aboard(jax.tree.map(lambda x, e=e: x[e], state), likings[e])
             said = onboard_pointer.inputs(own)
-            assert [*said, "ahead"] == list(view.__dataclass_fields__)
+            assert [*said, "ahead", "worth"] == list(view.__dataclass_fields__)
             for name, value in said.items():
                 want = getattr(view, name)[e]
                 assert value[0].dtype == want.dtype, name
