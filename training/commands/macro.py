@@ -154,9 +154,11 @@ def _numbers(args: Args) -> tuple[MacroConfig, Any, str]:
     from moonteam.policies import pointer
 
     spec, params = _mean(args.policy)
-    sees = {key: True for key in ("unfolds", "worths", "posts") if getattr(args.config.spec, key)}
-    spec = dataclasses.replace(spec, **sees)
-    params = pointer.grafted(spec, params)
+    sees = {key: True for key in ("unfolds", "worths", "posts")
+            if getattr(args.config.spec, key) and not getattr(spec, key)}
+    if sees:
+        spec = dataclasses.replace(spec, **sees)
+        params = pointer.grafted(spec, params)
     if args.config.spec.layers > spec.layers:
         params = pointer.deepened(spec, params, args.config.spec.layers)
         spec = dataclasses.replace(spec, layers=args.config.spec.layers)

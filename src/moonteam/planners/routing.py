@@ -33,7 +33,7 @@ class RoutingPlanner(RoutePlanner):
                  time_limit: float | None = 1.0):
         super().__init__(objective, alpha, beta)
         self.time_limit = self._limit = 1.0 if time_limit is None else time_limit
-        routing.library()
+        routing.pywrapcp()
 
     @classmethod
     def _trial(cls) -> RoutingPlanner:

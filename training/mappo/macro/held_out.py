@@ -83,10 +83,11 @@ class HeldOut:
             solved, took, missed = jax.device_get(
                 played(spec_of(policy), policy.source.params, self.problems))
             if self.family.draw.worth[1]:
-                served = self.problems.worth.sum(1) - missed
+                offered = self.problems.worth.sum(1)
+                done = offered - missed
                 return {"family": self.family.name, "success": float(solved.mean()),
-                        "makespan_gap": float(self.best.mean() / served.mean() - 1.0),
-                        "worth_served": float(served.sum() / self.problems.worth.sum())}
+                        "makespan_gap": float(self.best.mean() / done.mean() - 1.0),
+                        "worth_served": float(done.sum() / offered.sum())}
         else:
             done = rollouts(policy, self.problems)
             solved, took = done.solved[:, 0], done.seconds[:, 0]

@@ -67,7 +67,7 @@ class CpSatPlanner:
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit, with its bound."""
         compiled()
-        return self.plan_all(moment) if moment.worth is None else sharing(self, moment)
+        return sharing(self, moment)
 
     def plan_all(self, moment: Moment) -> TimedPlan:
         """The best plan found that serves all that is open."""

@@ -99,7 +99,7 @@ class ExactPlanner:
         """The best plan, of what it is best to serve. Raises InputError for too many targets or
         agents.
         """
-        return self.plan_all(moment) if moment.worth is None else leaving(self.plan_all, moment)
+        return leaving(self.plan_all, moment)
 
     def plan_all(self, moment: Moment) -> TimedPlan:
         """The best plan that serves all that is open."""

@@ -74,8 +74,6 @@ class GreedyPlanner:
         """A plan at once. Where targets lapse it may find none although there is one; those that
         need not be served are taken on by their worth.
         """
-        if moment.worth is None:
-            return self.plan_all(moment)
         return leaving(self.plan_all, moment, exactly=False)
 
     def plan_all(self, moment: Moment) -> TimedPlan:

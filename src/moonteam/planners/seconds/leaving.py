@@ -43,7 +43,7 @@ def better(moment: Moment, services: tuple[Service, ...], other: tuple[Service, 
 
 
 def leaving(plan: Plan, moment: Moment, exactly: bool = True) -> TimedPlan:
-    """The plan of `plan` for the targets that it is best to serve.
+    """The plan of `plan` for the targets that it is best to serve: for all, where all have to be.
 
     Args:
       plan: serves all that is open, or says that this is infeasible.
@@ -52,8 +52,10 @@ def leaving(plan: Plan, moment: Moment, exactly: bool = True) -> TimedPlan:
     """
     began = time.perf_counter()
     optional = moment.optional
+    if not len(optional):
+        return plan(moment)
     found = plan(moment)
-    if found.status == "infeasible" and len(optional):
+    if found.status == "infeasible":
         few = exactly and len(optional) <= EXACTLY
         found = (_best_set if few else _one_by_one)(plan, moment, optional, found)
     return replace(found, seconds=time.perf_counter() - began)
@@ -61,6 +63,8 @@ def leaving(plan: Plan, moment: Moment, exactly: bool = True) -> TimedPlan:
 
 def sharing(planner: Any, moment: Moment) -> TimedPlan:
     """The same of a planner whose `plan_all` takes its `time_limit`: all its plans share that."""
+    if not len(moment.optional):
+        return planner.plan_all(moment)
     one = copy.copy(planner)
     if planner.time_limit is not None:
         one.time_limit = planner.time_limit / (2 + len(moment.optional))

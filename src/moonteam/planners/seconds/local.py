@@ -281,7 +281,7 @@ class LocalSearchPlanner:
         """The best plan found within the limit."""
         if self.time_limit is not None:
             compiled()
-        return self.plan_all(moment) if moment.worth is None else sharing(self, moment)
+        return sharing(self, moment)
 
     def plan_all(self, moment: Moment) -> TimedPlan:
         """The best plan found that serves all that is open."""

@@ -83,12 +83,12 @@ class RoutingPlanner:
         self.objective: Objective = check(objective, alpha, beta)
         self.alpha, self.beta = alpha, beta
         self.time_limit = 1.0 if time_limit is None else time_limit
-        library()
+        pywrapcp()
 
     def plan(self, moment: Moment) -> TimedPlan:
         """The best plan found within the limit."""
         loaded()
-        return self.plan_all(moment) if moment.worth is None else sharing(self, moment)
+        return sharing(self, moment)
 
     def plan_all(self, moment: Moment) -> TimedPlan:
         """The best plan found that serves all that is open."""
@@ -105,7 +105,7 @@ class RoutingPlanner:
         return answer(self.name, self.objective, moment, services, None, False, began)
 
 
-def library() -> Any:
+def pywrapcp() -> Any:
     """OR-Tools' routing library. Raises InputError without it."""
     return ortools("constraint_solver.pywrapcp", "routing")
 
@@ -127,7 +127,7 @@ class _Model:
     """Nodes are the visits, then every agent's start, then every agent's end."""
 
     def __init__(self, work: Work, visits: Visits, alpha: float, beta: float, until: float):
-        self._lib = library()
+        self._lib = pywrapcp()
         self._visits = visits
         agents, count = len(work.free), len(visits.target)
         ends = [count + agents + a for a in range(agents)]

@@ -35,9 +35,8 @@ from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.labels import MAX_AGENTS
 from moonteam.planners.unfolding.deciders import NOT_DONE, Goal, by_time
 from moonteam.planners.unfolding.future import Future, future, may_lose
-from moonteam.planners.unfolding.ground import Post
 from moonteam.planners.unfolding.pointing import begun, moments, problem_in, said
-from moonteam.planners.unfolding.search import without_posts
+from moonteam.planners.unfolding.search import posts, without_posts
 from moonteam.planners.unfolding.state import distances
 from moonteam.planners.unfolding.world import View
 from moonteam.policies.pointer import PointerSpec
@@ -140,7 +139,7 @@ class LookingAhead:
             if plan is not None:
                 free = (held < 0) & (view.moment.free == 0) & view.moment.present & (plan >= 0)
                 # Whom the plan has nothing for waits where the policy says.
-                first = np.where((held >= 0) | (~free & _at_posts(view, tries[0])), tries[0],
+                first = np.where((held >= 0) | (~free & np.isin(tries[0], posts(view))), tries[0],
                                  np.where(free, plan, targets))
                 tries = np.insert(tries, 0 if self._goal == "makespan" else 1, first, axis=0)
             different = np.unique(tries, axis=0, return_index=True)[1]
@@ -235,12 +234,6 @@ class LookingAhead:
                                  first[own].astype(np.int32), self._preference))
         return tuple(np.concatenate(x)[:len(row)].astype(np.float64)
                      for x in zip(*jax.device_get(found), strict=True))
-
-
-def _at_posts(view: View, choice: np.ndarray) -> np.ndarray:
-    """[N] bool, whose choice is a place to wait at."""
-    posts = [len(view.targets) + k for k, look in enumerate(view.looks) if isinstance(look, Post)]
-    return np.isin(choice, posts)
 
 
 def sure(view: View) -> bool:

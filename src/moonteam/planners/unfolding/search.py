@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from moonteam.grid.macro.draw import places, post_places
-from moonteam.planners.seconds.base import NEVER, Moment
+from moonteam.planners.seconds.base import NEVER, Int64, Moment
 from moonteam.planners.unfolding.ground import INSIDE, Look, Post
 from moonteam.planners.unfolding.state import distances, ms
 from moonteam.planners.unfolding.world import View
@@ -173,10 +173,15 @@ def with_posts(view: View) -> View:
     return _with_columns(view, [Post((x, y), np.zeros((0, 2))) for x, y in spots], nobody)
 
 
+def posts(view: View) -> Int64:
+    """The columns of `moment` that are places to wait at."""
+    return np.array([k for k, look in enumerate(view.looks, len(view.targets))
+                     if isinstance(look, Post)], np.int64)
+
+
 def without_posts(view: View) -> Moment:
     """What there is to plan for: `moment`, its posts neither open nor of use."""
-    posts = [len(view.targets) + k for k, look in enumerate(view.looks) if isinstance(look, Post)]
-    return view.moment.without(np.array(posts, np.int64)) if posts else view.moment
+    return view.moment.without(posts(view))
 
 
 def _with_columns(view: View, looks: Sequence[Look], able: np.ndarray) -> View:
