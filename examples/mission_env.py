@@ -2,7 +2,7 @@
 
 python examples/mission_env.py sampling                                 # random allowed choices
 python examples/mission_env.py sampling exact
-python examples/mission_env.py sampling policy any_team_mappo
+python examples/mission_env.py sampling policy any_team
 """
 
 import sys

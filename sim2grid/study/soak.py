@@ -65,8 +65,6 @@ TEAMS = {1: 45, 2: 45, 3: 46, 4: 15, 5: 21, 6: 28}
 PLANNERS = {"exact": 0.3, "greedy": 0.25, "lns": 0.3, "policy": 0.15}
 """Each with its chance: a policy is compiled anew for each shape."""
 
-POLICIES = {"steps": "any_team", "seconds": "any_team_mappo"}
-"""Of the bundled ones, which decides by which clock: not all point at targets."""
 LIMITS = {"exact": 2.0, "lns": 0.05}
 """s a plan by the clock. lns spends them, so that its plans depend on the machine's speed."""
 
@@ -263,7 +261,7 @@ def who_decides(seed: int, number: int) -> Who:
     planner = str(rng.choice(list(PLANNERS), p=list(PLANNERS.values())))
     mode = MODES[rng.integers(len(MODES))]
     clock = mode == "clock"
-    return Who(planner, mode, number, POLICIES["seconds" if clock else "steps"],
+    return Who(planner, mode, number, "any_team",
                LIMITS.get(planner) if clock else None)
 
 

@@ -29,9 +29,9 @@ from training.sharding import devices_here
 @dataclass(frozen=True)
 class Args(Together, Apart, Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
-    on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one);
-    any_team_further goes on from it; unfolding where not everything is known; crews for many
-    robots of few kinds, needed several at once.
+    on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one, begun from
+    paper_team); any_team_further goes on from it; unfolding where not everything is known; crews
+    for many robots of few kinds, needed several at once.
 
     A decision is a target, held until something happens. Every number of the preset can be
     changed by an option.
@@ -42,8 +42,9 @@ class Args(Together, Apart, Watched):
       moonteam train paper_team --seed 1 --out runs/team-1
       moonteam train paper_team --seeds 0 1 2 --out runs/team
       moonteam train paper_team --seeds 0 1 2 --out runs/team --on ray://head:10001
-      moonteam train any_team --out runs/any --resume
-      moonteam train any_team_further --policy any_team_mappo --out runs/further
+      moonteam train any_team --policy paper_team --out runs/any --resume
+      moonteam train any_team --policy paper_team --out runs/any
+      moonteam train any_team_further --policy any_team --out runs/further
     """
 
     config: Annotated[MacroConfig, tyro.conf.arg(name="")]

@@ -47,7 +47,7 @@ class Args(Seeded, Limited, Resumable, Reported):
       moonteam evaluate unfolding unfolding/arrivals --planner exact --planner policy \
         --policy unfolding --futures 64 --foresee policies --goal waiting --limit 100
       moonteam evaluate unfolding unfolding/hidden --search nearest --search sweep
-      moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team_mappo
+      moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team
     """
 
     set: tyro.conf.Positional[str] = "unfolding/following"

@@ -81,7 +81,7 @@ def spec_of(policy: Policy) -> PointerSpec:
     """The network's size. Raises InputError if the policy does not point at targets."""
     if not isinstance(policy.brain, PointerBrain):
         raise InputError(policy.path, f"a network of kind {policy.source.kind} does not choose "
-                         "targets; one of kind pointer is needed, such as any_team_mappo")
+                         "targets; one of kind pointer is needed, such as any_team")
     return policy.brain.spec
 
 

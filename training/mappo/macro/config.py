@@ -171,29 +171,24 @@ ANY_TEAM = MacroConfig(
                       metric="either", unlike=0.3, limit=4000.0), shrink=4),
         Practice("2 to 6 robots, 8 to 14 targets",
                  Draw(agents=(2, 6), targets=(8, 14), sides=(16, 48), metric="either",
-                      unlike=0.3, limit=4000.0), shrink=8),
+                      unlike=0.3, limit=4000.0), shrink=4),
+        # Of many robots and targets whole tries say more than branches, and are cheap enough.
         Practice("5 to 8 robots, 12 to 24 targets",
                  Draw(agents=(5, 8), targets=(12, 24), num_skills=3, metric="either",
-                      unlike=0.3, limit=8000.0), shrink=32),
+                      unlike=0.3, limit=8000.0), shrink=16, advantages="tries"),
         Practice("6 to 8 robots, 24 to 40 targets",
                  Draw(agents=(6, 8), targets=(24, 40), metric="either", unlike=0.2,
-                      limit=8000.0), shrink=64),
+                      limit=8000.0), shrink=32, advantages="tries"),
     ),
     # Of many targets returns are long, and their squared error could drown the choices.
-    rounds=240, hyper=replace(HYPER, spread=True, vf_coef=0.05), chunk_rounds=2, eval_every=5)
+    rounds=300, hyper=replace(HYPER, spread=True, vf_coef=0.05, ema=0.9995), lr=1e-3,
+    spec=PointerSpec(layers=5), chunk_rounds=2, eval_every=5)
 
 PRESETS = {
     "quick": MacroConfig("quick", (PAPER,), rounds=90, hyper=HYPER),
     "paper_team": MacroConfig("paper_team", (PAPER,), rounds=600, hyper=HYPER),
     "any_team": ANY_TEAM,
-    "any_team_further": replace(
-        # A deeper network, whose noise is averaged over longer: it goes on from a good one.
-        ANY_TEAM, macro="any_team_further", rounds=150, lr=2e-4, spec=PointerSpec(layers=5),
-        hyper=replace(ANY_TEAM.hyper, ema=0.9995), families=(
-            *ANY_TEAM.families[:6],
-            # Of many robots and targets whole tries say more than branches, and are cheap enough.
-            *(replace(one, advantages="tries", shrink=one.shrink // 2)
-              for one in ANY_TEAM.families[6:]))),
+    "any_team_further": replace(ANY_TEAM, macro="any_team_further", rounds=150, lr=2e-4),
     "crews": MacroConfig(
         "crews", (
             Practice("6 to 12 robots of one kind, 9 to 20 targets for up to 5", CREW,

@@ -39,7 +39,9 @@ def draw_curve(path: Path, groups: dict[str, list[list[Row]]]) -> None:
             made = [row for row in rows if "entropy" in row]
             axes[2].plot([row["seconds"] / 60 for row in made], [row["entropy"] for row in made],
                          color=f"C{index}" if len(runs) > 1 else "0.3")
-    over_minutes(axes, (*TITLES, "entropy of a choice"))
+    worth = any("worth_served" in f for row in runs[0] for f in row.get("families", ()))
+    gap = "hindsight's worth over what is served, argmax" if worth else TITLES[1]
+    over_minutes(axes, (TITLES[0], gap, "entropy of a choice"))
     axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.98), 1.001)
     figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, ncols=4,
                   loc="outside lower center")

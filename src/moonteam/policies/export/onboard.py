@@ -1,6 +1,6 @@
 """What an exported policy is fed with, in NumPy alone: no JAX, nothing else of moonteam.
 
-    session = onnxruntime.InferenceSession("any_team.onnx")
+    session = onnxruntime.InferenceSession("any_team_imitated.onnx")
     seen = inputs(size=(32, 32), cells=cells, skills=skills, target_cells=spots,
                   target_skills=needs, target_and=both, solved=solved, steps_left=100)
     log_probs, pointer = session.run(None, seen)
