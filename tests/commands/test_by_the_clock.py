@@ -108,10 +108,12 @@ def test_no_robot_is_faster_than_its_kind(tiny, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(("words", "says"), [
-    (["plan", "TINY", "--planner", "policy"], "one of kind pointer is needed"),
+    (["plan", "TINY", "--planner", "policy", "--policy", "any_team_imitated"],
+     "one of kind pointer is needed"),
     (["plan", "TINY", "--clock", "steps"], "is by the clock"),
     (["plan", "TINY", "--planner", "exakt"], "did you mean exact"),
-    (["rollout", "TINY", "--planner", "policy"], "one of kind pointer is needed"),
+    (["rollout", "TINY", "--planner", "policy", "--policy", "any_team_imitated"],
+     "one of kind pointer is needed"),
     (["rollout", "TINY", "--mode", "barrier"], "is by the clock"),
     (["rollout", "TINY", "--backend", "fused"], "drives in steps"),
     (["evaluate", "execution", "--mode", "clock", "--lose", "1", "--count", "1"], "at_s")])

@@ -150,7 +150,8 @@ def test_options_are_checked_when_they_are_built(options, says):
 
 
 def test_every_option_reaches_its_planner():
-    options = PlannerOptions("weighted", 2.0, 3.0, 0.25, 7, "any_team", "best-of-8@0.25", 0.5)
+    options = PlannerOptions("weighted", 2.0, 3.0, 0.25, 7, "any_team_imitated", "best-of-8@0.25",
+                             0.5)
     for name in ("exact", "greedy", "lns", "exhaustive"):
         planner = registry.make(name, options)
         assert (planner.objective, planner.alpha, planner.beta) == ("weighted", 2.0, 3.0)
@@ -160,7 +161,8 @@ def test_every_option_reaches_its_planner():
     best = registry.make("policy", options)
     assert (best.objective, best.alpha, best.beta, best.preference, best.seed, best.rollouts,
             best.temperature) == ("weighted", 2.0, 3.0, 0.5, 7, 8, 0.25)
-    drawn = registry.make("policy", PlannerOptions(seed=7, decode="sample", preference=0.5))
+    drawn = registry.make("policy", PlannerOptions(
+        policy="any_team_imitated", seed=7, decode="sample", preference=0.5))
     assert (drawn.decode, drawn.seed, drawn.preference) == ("sample", 7, 0.5)
 
 

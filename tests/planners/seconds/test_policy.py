@@ -85,5 +85,5 @@ def test_nothing_to_do_and_nobody_to_do_it(policy, instances):
 
 def test_a_policy_of_another_kind_is_refused():
     with pytest.raises(InputError, match="one of kind pointer is needed"):
-        registry.find("policy").make(PlannerOptions())
+        registry.find("policy").make(PlannerOptions(policy="any_team_imitated"))
     assert not registry.find("policy").anytime
