@@ -106,8 +106,8 @@ def again(path: Path, who: Who, row: int) -> str:
     from sim2grid.study.soak import BLOCK
 
     return command.line("rollout", rollout.Args(
-        mission=(str(path),), planner=who.planner, policy=who.policy, time_limit=who.time_limit,
-        mode=who.mode, backend="native", seed=who.seed, row=(row, BLOCK))) + " --no-video"
+        mission=(str(path),), planner=who.planner, time_limit=who.time_limit, mode=who.mode,
+        backend="native", seed=who.seed, row=(row, BLOCK))) + " --no-video"
 
 
 def _document(args: Args, entries: list[Entry], seconds: float) -> dict[str, Any]:

@@ -82,14 +82,12 @@ class Who:
     planner: str
     mode: Mode
     seed: int
-    policy: str
     time_limit: float | None
 
     @property
     def options(self) -> PlannerOptions:
-        """What the planner is made from."""
-        return PlannerOptions("makespan", time_limit=self.time_limit, seed=self.seed,
-                              policy=self.policy)
+        """What the planner is made from; a policy is the one that ships."""
+        return PlannerOptions("makespan", time_limit=self.time_limit, seed=self.seed)
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -260,9 +258,7 @@ def who_decides(seed: int, number: int) -> Who:
     rng = np.random.default_rng([seed, number, 2])
     planner = str(rng.choice(list(PLANNERS), p=list(PLANNERS.values())))
     mode = MODES[rng.integers(len(MODES))]
-    clock = mode == "clock"
-    return Who(planner, mode, number, "any_team",
-               LIMITS.get(planner) if clock else None)
+    return Who(planner, mode, number, LIMITS.get(planner) if mode == "clock" else None)
 
 
 def recipe_targets(seed: int, number: int) -> int:
