@@ -69,10 +69,12 @@ def test_rows_over_futures_are_those_asked_for():
         return [row.name for row in unfolding.rows_of(contenders, *words, **more)]
 
     exact, policy = "exact(makespan)", "policy(argmax)"
-    assert names([8], [], ["waiting"], ahead=True, foresee="policies") == [
+    assert names([8], [], ["waiting"], ahead=True, foresee=["policies"]) == [
         exact, policy, f"{policy} over 8 futures, waiting"]
-    assert names([8], [], (), ahead=True, foresee="planners") == [
+    assert names([8], [], (), ahead=True, foresee=["planners"]) == [
         exact, f"{exact} over 8 futures", policy]
+    assert names([2, 8], [], (), ahead=True, foresee=["planners", "policies"]) == [
+        exact, f"{exact} over 2 futures", policy, f"{policy} over 8 futures"]
     # Nobody but a policy looks ahead to places to look from.
     assert names([8], ["sweep", "places"], (), ahead=True) == [
         f"{exact}, sweep", f"{exact} over 8 futures, sweep", f"{exact}, places",
@@ -126,6 +128,8 @@ def test_a_third_of_the_missions_lose_one_robot():
     (["3x5"], "3x5: is in steps"), (["--futures", "1"], "--futures: 1 is not allowed; 2 to 4096"),
     (["--goal", "waiting"], "--goal: has no effect without --futures"),
     (["--foresee", "policies"], "--foresee: has no effect without --futures"),
+    (["--futures", "4", "--foresee", "all", "--foresee", "policies"],
+     "--foresee: given 2 times; once, or as often as --futures"),
     (["--search", "sweep"], "--search sweep: has no effect where no target is hidden; stay"),
     (["--planner", "best"], "no such planner by the clock"),
     (["--decode", "sample"], "--decode: has no effect without --planner policy"),

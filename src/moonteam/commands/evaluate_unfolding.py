@@ -46,6 +46,8 @@ class Args(Seeded, Limited, Resumable, Reported):
       moonteam evaluate unfolding --planner policy --policy unfolding --futures 256 --limit 200
       moonteam evaluate unfolding unfolding/arrivals --planner exact --planner policy \
         --policy unfolding --futures 64 --foresee policies --goal waiting --limit 100
+      moonteam evaluate unfolding --planner exact --planner policy --policy unfolding \
+        --futures 2 --foresee planners --futures 64 --foresee policies
       moonteam evaluate unfolding unfolding/hidden --search nearest --search sweep
       moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team
     """
@@ -59,8 +61,9 @@ class Args(Seeded, Limited, Resumable, Reported):
     """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
     themselves in the futures; where ways take what is expected, thousands of them in one call, and
     what they try is then the plan of what is known beside their own choices."""
-    foresee: Literal["all", "policies", "planners"] = "all"
-    """Rows that are repeated over futures: all, those of policies, or those of other planners."""
+    foresee: Many[tuple[Literal["all", "policies", "planners"], ...]] = ()
+    """Rows that are repeated over futures: all (default), those of policies, or those of other
+    planners. Again, as often as --futures: for each of these numbers in turn."""
     goal: Many[tuple[Goal, ...]] = ()
     """What is to be least over futures: makespan, or waiting, which is how long targets wait for
     their services; again for more rows. Default: makespan."""
@@ -92,7 +95,7 @@ def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
     hidden = any(target.hidden for one in found for target in one.targets)
     for search in args.search:
         check_search(search, hidden)
-    for option, given in (("--goal", args.goal), ("--foresee", args.foresee != "all")):
+    for option, given in (("--goal", args.goal), ("--foresee", args.foresee)):
         if given and not args.futures:
             raise InputError(option, "has no effect without --futures")
     others = any(one.expects is not None and one.expects.scatter for one in found)

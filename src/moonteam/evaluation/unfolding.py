@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import MS, TimedPlanner, enough, moment
 from moonteam.planners.seconds.policy import PolicyPlanner
@@ -68,8 +69,8 @@ COLUMNS = (
     Column("effort", "s under way", lambda value: f"{value:.1f}"),
     Column("decisions", "decisions", lambda value: f"{value:.1f}"),
     Column("decision_seconds", "a decision takes", tables.duration))
-PAGE = COLUMNS[:-1]
-"""Columns of the Markdown table: without the time, which depends on what else a machine does."""
+PAGE = COLUMNS
+"""Columns of the Markdown table."""
 
 
 @dataclass(frozen=True)
@@ -166,24 +167,27 @@ class Played:
 
 def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             patterns: Sequence[str], goals: Sequence[Goal] = (), ahead: bool = False,
-            foresee: str = "all") -> list[Row]:
+            foresee: Sequence[str] = ()) -> list[Row]:
     """Every planner alone, then over so many futures, by every pattern of search.
 
     `ahead`: ways take what is expected, so that policies can look ahead in the macro world; where
     targets are hidden, by places to look from, and where these are asked for by them alone.
-    `foresee` says whose rows are repeated over futures: all, those of policies, or of other
-    planners.
+    `foresee` says whose rows are repeated over each number of futures: all, those of policies, or
+    of other planners; one word holds for every number.
 
-    Raises InputError for a number of futures that is none.
+    Raises InputError for a number of futures that is none, and words that are more or fewer.
     """
     for count in futures:
         check_futures(count)
+    if len(foresee) not in (0, 1, len(futures)):
+        raise InputError("--foresee", f"given {len(foresee)} times; once, or as often as --futures")
+    whose = foresee if len(foresee) > 1 else list(foresee or ["all"]) * len(futures)
     found = []
     for one in contenders:
         points = pointing(one.planner) is not None
-        over = futures if not one.together or points else ()
-        if foresee != "all" and isinstance(one.planner, PolicyPlanner) != (foresee == "policies"):
-            over = ()
+        kind = "policies" if isinstance(one.planner, PolicyPlanner) else "planners"
+        over = [count for count, who in zip(futures, whose, strict=True)
+                if who in ("all", kind) and (not one.together or points)]
         for pattern in ["" if name == STAY else name for name in patterns] or [""]:
             found += [Row(one, 0, pattern)]
             looks = ahead and points and pattern in ALL_AT_ONCE
