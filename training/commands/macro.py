@@ -30,7 +30,7 @@ from training.sharding import devices_here
 class Args(Together, Apart, Watched):
     """Train a policy for any team by multi-agent PPO, from scratch, no teacher: quick (5 minutes
     on two cores), paper_team (3 robots, 5 to 7 targets) or any_team (the shipped one, begun from
-    paper_team); any_team_further goes on from it; unfolding where not everything is known; crews
+    paper_team), whose last step is any_team_further; unfolding where not everything is known; crews
     for many robots of few kinds, needed several at once.
 
     A decision is a target, held until something happens. Every number of the preset can be
