@@ -43,7 +43,7 @@ class Args(Together, Apart, Watched):
       moonteam train paper_team --seeds 0 1 2 --out runs/team
       moonteam train paper_team --seeds 0 1 2 --out runs/team --on ray://head:10001
       moonteam train any_team --policy paper_team --out runs/any --resume
-      moonteam train any_team_further --policy any_team --out runs/further
+      moonteam train any_team_further --policy runs/any/policy.safetensors --out runs/further
     """
 
     config: Annotated[MacroConfig, tyro.conf.arg(name="")]
