@@ -54,8 +54,6 @@ def choosing(planner: TimedPlanner, mission: Mission, search: Search | None = No
         check_search(search, mission.searches)
     if mission.searches and search is None:
         search = PLACES if futures and pointing(planner) else "nearest"
-    if futures and search == PLACES and not pointing(planner):
-        raise InputError("--search places", "over futures is for policies; give another pattern")
     expects = mission.expects
     certain = expects is None or not expects.scatter
     return Scouting(planner.name, decider_of(

@@ -38,7 +38,7 @@ from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.base import MS, Moment
 from moonteam.planners.seconds.keeper import Keeper
-from moonteam.planners.unfolding.make import PLACES, Search, check_futures
+from moonteam.planners.unfolding.make import Search, check_futures
 from moonteam.policies.brain import PointerBrain
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar
@@ -484,13 +484,8 @@ def unfolded(rows: Sequence[Contender], searches: Sequence[Search], futures: Seq
     """
     for count in futures:
         check_futures(count)
-    found = []
-    for row, search in itertools.product(rows, searches or (None,)):
-        for count in (0, *futures):
-            # Over futures places are looked from by policies alone.
-            if not (count and search == PLACES and row.planner != "policy"):
-                found.append(msgspec.structs.replace(row, search=search, futures=count))
-    return found
+    return [msgspec.structs.replace(row, search=search, futures=count)
+            for row, search, count in itertools.product(rows, searches or (None,), (0, *futures))]
 
 
 def maker(contender: Contender) -> Callable[[], Planner]:

@@ -75,10 +75,12 @@ def test_rows_over_futures_are_those_asked_for():
         exact, f"{exact} over 8 futures", policy]
     assert names([2, 8], [], (), ahead=True, foresee=["planners", "policies"]) == [
         exact, f"{exact} over 2 futures", policy, f"{policy} over 8 futures"]
-    # Nobody but a policy looks ahead to places to look from.
+    # Over futures by places alone, where these are asked for; plans agree on what ends soonest.
     assert names([8], ["sweep", "places"], (), ahead=True) == [
-        f"{exact}, sweep", f"{exact} over 8 futures, sweep", f"{exact}, places",
+        f"{exact}, sweep", f"{exact}, places", f"{exact} over 8 futures, places",
         f"{policy}, sweep", f"{policy}, places", f"{policy} over 8 futures, places"]
+    assert names([8], ["places"], ["waiting"], ahead=True) == [
+        f"{exact}, places", f"{policy}, places", f"{policy} over 8 futures, waiting, places"]
     assert f"{policy} over 8 futures, sweep" in names([8], ["sweep"], (), ahead=True)
 
 

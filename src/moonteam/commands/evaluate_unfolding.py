@@ -34,7 +34,9 @@ class Args(Seeded, Limited, Resumable, Reported):
 
     Where targets are hidden, robots that have nothing else to do look for them: nearest, to the
     nearest ground not seen yet, or sweep, up and down a strip each. With places, places to look
-    from are planned for as if they were targets (by lns or a policy such as searching).
+    from are planned for as if they were targets (by lns or a policy such as searching); over K
+    futures lns then plans for the hidden targets of each, every one after the place that sees it,
+    and does what most of the plans begin with.
 
     Files in --out: report.json, summary.csv, rows.csv, table.md and unfolding.png; and rows.jsonl,
     to which each mission is added as it is played (a policy's as a whole), so that --resume goes
@@ -49,6 +51,8 @@ class Args(Seeded, Limited, Resumable, Reported):
       moonteam evaluate unfolding --planner exact --planner policy --policy unfolding \
         --futures 2 --foresee planners --futures 64 --foresee policies
       moonteam evaluate unfolding unfolding/hidden --search nearest --search sweep
+      moonteam evaluate unfolding unfolding/hidden --planner lns --time-limit 0.01 \
+        --search nearest --search places --futures 32 --limit 100
       moonteam evaluate unfolding unfolding/losses --planner policy --policy any_team
     """
 

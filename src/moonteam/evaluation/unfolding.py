@@ -171,7 +171,8 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
     """Every planner alone, then over so many futures, by every pattern of search.
 
     `ahead`: ways take what is expected, so that policies can look ahead in the macro world; where
-    targets are hidden, by places to look from, and where these are asked for by them alone.
+    targets are hidden, by places to look from. Where these are asked for, rows are repeated over
+    futures by them alone; what plans agree on there (`consensus`) is for the makespan.
     `foresee` says whose rows are repeated over each number of futures: all, those of policies, or
     of other planners; one word holds for every number.
 
@@ -191,10 +192,13 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
         for pattern in ["" if name == STAY else name for name in patterns] or [""]:
             found += [Row(one, 0, pattern)]
             looks = ahead and points and pattern in ALL_AT_ONCE
-            # By a pattern every mission is imagined by itself, which takes many times as long.
-            slow = pattern == PLACES or (ahead and points and PLACES in patterns)
-            found += [Row(one, count, pattern, goal, looks) for count in over
-                      for goal in goals or GOALS[:1] if looks or not slow]
+            aims: Sequence[Goal] = goals or GOALS[:1]
+            if pattern == PLACES and not points:
+                aims = [goal for goal in aims if goal == GOALS[0]]
+            elif PLACES in patterns and not looks:
+                # By a pattern every mission is imagined by itself, which takes much longer.
+                aims = []
+            found += [Row(one, count, pattern, goal, looks) for count in over for goal in aims]
     return found
 
 

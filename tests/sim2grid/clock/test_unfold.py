@@ -40,10 +40,10 @@ def hidden(mission):
     return mission([DRONE, ROVER], [], size=(24, 24), events=HIDDEN)
 
 
-@pytest.mark.parametrize(("name", "search"), [("exact", "nearest"), ("exact", "sweep"),
-                                          ("lns", "places")])
-def test_hidden_targets_are_found_and_served(drive, hidden, name, search):
-    done = drive(hidden, chooser=who(hidden, name, search=search))
+@pytest.mark.parametrize(("name", "search", "futures"), [
+    ("exact", "nearest", 0), ("exact", "sweep", 0), ("lns", "places", 0), ("lns", "places", 4)])
+def test_hidden_targets_are_found_and_served(drive, hidden, name, search, futures):
+    done = drive(hidden, chooser=who(hidden, name, search=search, futures=futures))
     assert done.record.success
     assert [cause for _, cause in done.record.replans].count("found") == 2
     assert 0.2 < done.unfolding.ground.share <= 1.0
@@ -165,11 +165,9 @@ def test_a_mission_that_cannot_be_says_why(change, key):
     assert error.value.key == key
 
 
-def test_options_that_mean_nothing_are_refused(mission, hidden):
+def test_options_that_mean_nothing_are_refused(mission):
     plain = mission([DRONE], [{"at": [5, 5], "skills": ["A"]}])
     with pytest.raises(InputError, match="--search"):
         who(plain, search="nearest")
     with pytest.raises(InputError, match="--futures"):
         who(plain, futures=8)
-    with pytest.raises(InputError, match="--search places"):
-        who(hidden, "lns", search="places", futures=8)

@@ -13,6 +13,7 @@ from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.keeper import HOME
 from moonteam.planners.seconds.policy import PolicyPlanner
 from moonteam.planners.unfolding.ahead import LookingAhead
+from moonteam.planners.unfolding.consensus import Consensus
 from moonteam.planners.unfolding.deciders import Choose, Decider, Goal, OverFutures, Replanning
 from moonteam.planners.unfolding.pointing import Pointing
 from moonteam.planners.unfolding.search import Middle, NearestUnseen, Pattern, Sweep
@@ -103,6 +104,8 @@ def decider_of(planner: TimedPlanner, *, search: str = "", futures: int = 0,
     if futures and certain and isinstance(planner, PolicyPlanner) and search in ALL_AT_ONCE:
         return Choosing(LookingAhead(planner.policy, futures, goal, seed,
                                      planner.preference).choose, replanning)
+    if futures and search == PLACES:
+        return Choosing(Consensus(planner, futures, seed).choose, replanning)
     if futures:
         return OverFutures(planner if choose is None else ExactPlanner(), futures, seed, pattern,
                            choose, goal)

@@ -188,32 +188,50 @@ def _with_columns(view: View, looks: Sequence[Look], able: np.ndarray) -> View:
     """The view with these places, each of which needs one of those who are `able` [N] bool, if any
     are.
     """
-    now, metric = view.moment, view.state.problem.metric
-    more, targets = len(looks), len(view.targets)
-    places = np.array([look.at for look in looks], float).reshape(-1, 2)
-    spots = np.concatenate([np.array([t.at for t in view.targets], float).reshape(-1, 2), places])
+    now, count = view.moment, len(looks)
+    moment = replace(now, has=np.concatenate([now.has, able[:, None]], 1),
+                     need=np.pad(now.need, ((0, 0), (0, 1))))
+    need = np.zeros((count, moment.need.shape[1]), np.int64)
+    need[:, -1] = able.any()
+    spots = np.array([look.at for look in looks], float).reshape(-1, 2)
+    shown = with_more(replace(view, moment=moment), spots, need, np.zeros(count, bool),
+                      np.zeros((count, len(now.solved)), bool))
+    return replace(view, moment=shown, looks=tuple(looks))
+
+
+def with_more(view: View, more: np.ndarray, need: np.ndarray, either: np.ndarray,
+              after: np.ndarray) -> Moment:
+    """The view's moment with columns for P targets more, the last ones, without services.
+
+    Args:
+      view: of M columns: its targets, then its places to look from.
+      more: [P, 2] m, where they are.
+      need: [P, S] how many with each skill they need.
+      either: [P] bool, whether anybody with one of these skills will do.
+      after: [P, M] bool, which of the columns have to be solved before.
+    """
+    now, metric, count = view.moment, view.state.problem.metric, len(more)
+    known = [*(t.at for t in view.targets), *(look.at for look in view.looks)]
+    spots = np.concatenate([np.array(known, float).reshape(-1, 2), more])
     speeds = np.array([agent.speed for agent in view.agents])
     far = distances(spots, spots, metric)
     of_class = [speeds[now.classes == c][0] for c in range(len(now.between))]
     between = np.stack([ms(far, speed) for speed in of_class])
-    between[:, :targets, :targets] = now.between
-    need = np.zeros((targets + more, now.need.shape[1] + 1), np.int64)
-    need[:targets, :-1], need[targets:, -1] = now.need, able.any()
-    after = np.zeros((targets + more,) * 2, bool)
-    after[:targets, :targets] = now.after
+    between[:, :len(known), :len(known)] = now.between
+    waits = np.pad(now.after, ((0, count), (0, count)))
+    waits[len(known):, :len(known)] = after
 
     def longer(column: np.ndarray, value: int = 0) -> np.ndarray:
-        return np.concatenate([column, np.full(more, value, column.dtype)])
+        return np.concatenate([column, np.full(count, value, column.dtype)])
 
-    start = ms(distances(view.places, places, metric), speeds[:, None])
-    moment = replace(
+    start = ms(distances(view.places, more, metric), speeds[:, None])
+    return replace(
         now, start=np.concatenate([now.start, start], 1), between=between,
         home=np.concatenate([now.home, np.zeros_like(start)], 1),
-        has=np.concatenate([now.has, able[:, None]], 1), need=need, either=longer(now.either),
-        service=longer(now.service), after=after, appears=longer(now.appears),
+        need=np.concatenate([now.need, need]), either=np.concatenate([now.either, either]),
+        service=longer(now.service), after=waits, appears=longer(now.appears),
         lapses=longer(now.lapses, NEVER), solved=longer(now.solved), ends=longer(now.ends),
         middle=view.state.middle(spots), worth=None if now.worth is None else longer(now.worth))
-    return replace(view, moment=moment, looks=tuple(looks))
 
 
 def from_afar(here: np.ndarray, point: np.ndarray, reach: float) -> Place:

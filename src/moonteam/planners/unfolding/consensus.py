@@ -1,0 +1,86 @@
+"""Where targets are hidden: what the plans for many futures agree on.
+
+After the consensus function of Bent and Van Hentenryck (2004, "Scenario-based planning for
+partially dynamic vehicle routing with stochastic customers", Operations Research 52). In each
+future drawn, the hidden targets are put somewhere on unseen ground and planned for as if they were
+known, but each after the place from which its part of the ground is looked at: so a plan goes
+nowhere for what nobody can know yet, and yet has those who will be needed near, and looks first
+where finding something late would cost most. What is done is how that plan begins whose first
+moves most of the plans share.
+
+Legend: K futures, N robots, M columns of a moment: targets known of, and places to look from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from moonteam.planners.seconds.base import Int64, Moment, TimedPlanner
+from moonteam.planners.seconds.keeper import WAIT, choices, order_of
+from moonteam.planners.unfolding.future import future
+from moonteam.planners.unfolding.search import with_more
+from moonteam.planners.unfolding.world import View
+from moonteam.problem.timed import Target
+
+
+class Consensus:
+    """Decides by plans for sampled futures; where nothing is hidden by the plan of what is known.
+
+    Args:
+      planner: whose plans they are.
+      futures: K.
+      seed: of the draws.
+    """
+
+    def __init__(self, planner: TimedPlanner, futures: int, seed: int = 0):
+        self._planner, self._count = planner, futures
+        self._rng = np.random.default_rng(seed)
+
+    def choose(self, views: Sequence[View]) -> list[Int64]:
+        """Of each view, [N] a column of its moment, WAIT, or of a plan HOME."""
+        return [self._of(view) for view in views]
+
+    def _of(self, view: View) -> Int64:
+        found = []
+        if view.coming and view.looks:
+            for _ in range(self._count):
+                moment, seen_from = with_hidden(view, future(view, self._rng).coming)
+                chosen = self._first(moment)
+                if chosen is not None:
+                    # Who is to serve what is hidden goes to where it will be found.
+                    found.append(np.where(chosen >= 0, seen_from[chosen], chosen))
+        if found:
+            return agreed(np.array(found))
+        chosen = self._first(view.moment)
+        return np.full(len(view.places), WAIT) if chosen is None else chosen
+
+    def _first(self, moment: Moment) -> Int64 | None:
+        plan = self._planner.plan(moment)
+        return None if plan.status == "infeasible" else choices(moment, order_of(plan))
+
+
+def with_hidden(view: View, coming: Sequence[Target]) -> tuple[Moment, Int64]:
+    """The moment with these targets too, each after the place to look from that sees it; and of
+    each of its columns the one to go to, which is that place for them.
+    """
+    count, names = len(view.moment.solved), view.state.names
+    need = np.zeros((len(coming), view.moment.need.shape[1]), np.int64)
+    after = np.zeros((len(coming), count), bool)
+    seen_from = np.arange(count + len(coming))
+    for row, target in enumerate(coming):
+        asks = target.needs()
+        need[row, :len(names)] = [asks.get(name, 0) for name in names]
+        gaps = [np.hypot(*(look.unseen - target.at).T).min() for look in view.looks]
+        seen_from[count + row] = len(view.targets) + int(np.argmin(gaps))
+        after[row, seen_from[count + row]] = True
+    either = np.array([target.type == "OR" and not target.coalition for target in coming], bool)
+    spots = np.array([target.at for target in coming], float).reshape(-1, 2)
+    return with_more(view, spots, need, either, after), seen_from
+
+
+def agreed(moves: Int64) -> Int64:
+    """[N] those of the joint moves [K, N] of which, robot by robot, most others have the same."""
+    votes = (moves[:, None] == moves[None]).sum((1, 2))
+    return moves[int(votes.argmax())]
