@@ -35,8 +35,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     Where targets are hidden, robots that have nothing else to do look for them: nearest, to the
     nearest ground not seen yet, or sweep, up and down a strip each. With places, places to look
     from are planned for as if they were targets (by lns or a policy such as searching); over K
-    futures lns then plans for the hidden targets of each, every one after the place that sees it,
-    and does what most of the plans begin with.
+    futures the hidden targets of each are then planned for too, every one after the place that sees
+    it, and what most of the plans begin with is done.
 
     Files in --out: report.json, summary.csv, rows.csv, table.md and unfolding.png; and rows.jsonl,
     to which each mission is added as it is played (a policy's as a whole), so that --resume goes
@@ -64,7 +64,8 @@ class Args(Seeded, Limited, Resumable, Reported):
     futures: Many[tuple[int, ...]] = ()
     """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
     themselves in the futures; where ways take what is expected, thousands of them in one call, and
-    what they try is then the plan of what is known beside their own choices."""
+    what they try is then the plan of what is known beside their own choices. Where targets are
+    hidden, by places, what most futures ask for is done."""
     foresee: Many[tuple[Literal["all", "policies", "planners"], ...]] = ()
     """Rows that are repeated over futures: all (default), those of policies, or those of other
     planners. Again, as often as --futures: for each of these numbers in turn."""

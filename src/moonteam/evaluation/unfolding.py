@@ -170,9 +170,9 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             foresee: Sequence[str] = ()) -> list[Row]:
     """Every planner alone, then over so many futures, by every pattern of search.
 
-    `ahead`: ways take what is expected, so that policies can look ahead in the macro world; where
-    targets are hidden, by places to look from. Where these are asked for, rows are repeated over
-    futures by them alone; what plans agree on there (`consensus`) is for the makespan.
+    `ahead`: ways take what is expected, so that policies can look ahead in the macro world. Where
+    targets are hidden and places to look from are asked for, rows are repeated over futures by
+    them alone; what is agreed on there (`consensus`) is for the makespan.
     `foresee` says whose rows are repeated over each number of futures: all, those of policies, or
     of other planners; one word holds for every number.
 
@@ -193,9 +193,9 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             found += [Row(one, 0, pattern)]
             looks = ahead and points and pattern in ALL_AT_ONCE
             aims: Sequence[Goal] = goals or GOALS[:1]
-            if pattern == PLACES and not points:
+            if pattern == PLACES:
                 aims = [goal for goal in aims if goal == GOALS[0]]
-            elif PLACES in patterns and not looks:
+            elif PLACES in patterns:
                 # By a pattern every mission is imagined by itself, which takes much longer.
                 aims = []
             found += [Row(one, count, pattern, goal, looks) for count in over for goal in aims]

@@ -176,45 +176,6 @@ def test_hidden_targets_are_found_by_planning_where_to_look(planner):
         assert world.outcome.seconds >= problem.optimal.bound - 0.02
 
 
-def test_a_policy_looks_for_hidden_targets_and_ahead_to_where_they_may_be():
-    problems = missions("hidden", 2)
-    worlds = [World(one) for one in problems]
-    play_together(worlds, Pointing(POLICY).choose,
-                  [Replanning(ExactPlanner(), places=True) for _ in problems])
-    assert all(world.outcome.success for world in worlds)
-    view = with_looks(World(problems[0]).view())
-    (chosen,) = LookingAhead(POLICY, 2).choose([view])
-    assert (chosen >= len(view.targets)).any()  # somebody looks
-    assert (chosen < len(view.moment.solved)).all()
-
-
-def test_a_hidden_target_is_known_once_somebody_has_looked_from_near_it():
-    view = with_looks(World(missions("hidden", 1)[0]).view())
-    drawn = [future(view, np.random.default_rng(5))]
-    problems = imagined(view, drawn, 24)
-    problem = jax.tree.map(lambda x: x[0], problems)
-    state = macro_world.reset(problem)
-    first = len(view.targets) + len(view.looks)
-    hidden = np.arange(24)[first:first + view.coming]
-    assert not np.asarray(macro_world.known(state))[hidden].any()
-    assert int(macro_world.coming(state)) == view.coming
-    for k in range(len(view.targets), first):
-        solved = np.zeros(24, bool)
-        solved[k] = True
-        seen = np.asarray(macro_world.known(replace(state, solved=solved)))[hidden]
-        near = [np.hypot(*(np.array(t.at) - view.looks[k - len(view.targets)].at)) <= 6.0
-                for t in drawn[0].coming]
-        assert seen.tolist() == near
-    everything = np.asarray(problem.looks) | ~np.asarray(problem.target_mask)
-    there = replace(state, solved=everything)
-    assert int(macro_world.coming(there)) == 0
-    # Nobody need look any more; who serves what was found ends it.
-    part = replace(state, solved=everything & (np.arange(24) != len(view.targets)))
-    if int(macro_world.coming(part)) == 0:
-        assert not np.asarray(macro_world.open_targets(part))[len(view.targets)]
-    assert bool(macro_world.finished(replace(state, solved=~np.asarray(problem.looks))))
-
-
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_who_may_be_lost_does_first_what_nobody_else_can(side):
     """Two targets as far to either side: the one that any can serve may wait for the slow one."""

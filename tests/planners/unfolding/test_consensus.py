@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from moonteam import loading, paths
+from moonteam.planners.kind import PlannerOptions
+from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.keeper import HOME, choices, order_of
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.unfolding.consensus import Consensus, agreed, with_hidden
 from moonteam.planners.unfolding.deciders import play
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.make import PLACES, decider_of
+from moonteam.planners.unfolding.pointing import Pointing
 from moonteam.planners.unfolding.search import with_looks
 from moonteam.planners.unfolding.world import World
 from moonteam.problem import timed
@@ -82,6 +85,27 @@ def test_the_same_seed_decides_alike_and_where_nothing_is_hidden_by_the_plan_alo
     (chosen,) = Consensus(search(), 4).choose([view])
     np.testing.assert_array_equal(
         chosen, choices(view.moment, order_of(search().plan(view.moment))))
+
+
+def test_a_policy_looks_for_hidden_targets_and_says_where_they_may_be_in_one_call():
+    policy = timed_planners.find("policy").make(PlannerOptions(policy=paths.find(
+        "any_team", "policies", ".safetensors")))
+    calls = []
+
+    def choose(views):
+        calls.append([len(view.moment.solved) for view in views])
+        assert not any(view.looks for view in views)  # targets like the others
+        return Pointing(policy.policy).choose(views)
+
+    problem = missions(1)[0]
+    view = with_looks(World(problem).view())
+    (chosen,) = Consensus(policy, 8, choose=choose).choose([view])
+    assert calls == [[len(view.moment.solved) + view.coming] * 8]
+    assert (chosen >= len(view.targets)).any()  # somebody looks
+    assert (chosen < len(view.moment.solved)).all()
+    world = World(problem)
+    world.step(decider_of(policy, search=PLACES, futures=8).act(world.view()))
+    assert world.state.now > 0
 
 
 def test_without_a_plan_it_waits():

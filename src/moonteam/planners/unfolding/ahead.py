@@ -1,7 +1,7 @@
 """A policy that looks ahead: it plays what a plan says, and what else it could do, in many futures.
 
-Where targets follow on others, arrive by a clock or are hidden, or a robot may be lost, what is to
-come can be drawn, and the policy can go on in each of these futures by its likeliest choices to the
+Where targets follow on others or arrive by a clock, or a robot may be lost, what is to come can be
+drawn, and the policy can go on in each of these futures by its likeliest choices to the
 end, thousands of them in one call of the macro world. That is one step of policy iteration, at the
 moment itself. What is tried there is the plan of what is known, and what the policy draws; where
 nothing more may come to pass, the plan is all that is needed.
@@ -47,7 +47,7 @@ HEAT = 2.0
 TRIES = 16
 """Joint choices drawn at a moment, the likeliest first; equal ones are one."""
 EXACTLY = 10
-"""Targets, places to look from counted, up to which the plan of what is known is exact."""
+"""Targets up to which the plan of what is known is exact."""
 MOVES = 300
 """Of local search for each of more."""
 FIRST = 16
@@ -337,11 +337,6 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
         value = np.asarray(getattr(known, name))
         columns[name] = np.broadcast_to(value, (count, *value.shape))
     columns |= {"coming": np.zeros(count, np.int32), "sight": np.zeros_like(waits)}
-    if view.looks:
-        reach = max(agent.sensor or 0.0 for agent in view.agents)
-        hidden = np.zeros((count, size), bool)
-        hidden[:, len(open_):total] = [[target.hidden for target in ts] for ts in after]
-        columns["sight"] = (far <= reach) & hidden[:, :, None] & columns["looks"][:, None]
     return MacroProblem(**columns)
 
 

@@ -6,7 +6,8 @@ future drawn, the hidden targets are put somewhere on unseen ground and planned 
 known, but each after the place from which its part of the ground is looked at: so a plan goes
 nowhere for what nobody can know yet, and yet has those who will be needed near, and looks first
 where finding something late would cost most. What is done is how that plan begins whose first
-moves most of the plans share.
+moves most of the plans share. A policy that points at targets need not plan: what it points at in
+each future is its first move, all futures in one call.
 
 Legend: K futures, N robots, M columns of a moment: targets known of, and places to look from.
 """
@@ -14,11 +15,13 @@ Legend: K futures, N robots, M columns of a moment: targets known of, and places
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from moonteam.planners.seconds.base import Int64, Moment, TimedPlanner
 from moonteam.planners.seconds.keeper import WAIT, choices, order_of
+from moonteam.planners.unfolding.deciders import Choose
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.search import with_more
 from moonteam.planners.unfolding.world import View
@@ -32,10 +35,12 @@ class Consensus:
       planner: whose plans they are.
       futures: K.
       seed: of the draws.
+      choose: who says, in place of the planner, what everybody goes for first.
     """
 
-    def __init__(self, planner: TimedPlanner, futures: int, seed: int = 0):
-        self._planner, self._count = planner, futures
+    def __init__(self, planner: TimedPlanner, futures: int, seed: int = 0,
+                 choose: Choose | None = None):
+        self._planner, self._count, self._choose = planner, futures, choose
         self._rng = np.random.default_rng(seed)
 
     def choose(self, views: Sequence[View]) -> list[Int64]:
@@ -43,22 +48,26 @@ class Consensus:
         return [self._of(view) for view in views]
 
     def _of(self, view: View) -> Int64:
-        found = []
+        moves = []
         if view.coming and view.looks:
-            for _ in range(self._count):
-                moment, seen_from = with_hidden(view, future(view, self._rng).coming)
-                chosen = self._first(moment)
-                if chosen is not None:
-                    # Who is to serve what is hidden goes to where it will be found.
-                    found.append(np.where(chosen >= 0, seen_from[chosen], chosen))
-        if found:
-            return agreed(np.array(found))
-        chosen = self._first(view.moment)
-        return np.full(len(view.places), WAIT) if chosen is None else chosen
+            drawn = [with_hidden(view, future(view, self._rng).coming) for _ in range(self._count)]
+            firsts = self._firsts(view, [moment for moment, _ in drawn])
+            # Who is to serve what is hidden goes to where it will be found.
+            moves = [np.where(first >= 0, seen_from[first], first)
+                     for first, (_, seen_from) in zip(firsts, drawn, strict=True)
+                     if first is not None]
+        if moves:
+            return agreed(np.array(moves))
+        (first,) = self._firsts(view, [view.moment])
+        return np.full(len(view.places), WAIT) if first is None else first
 
-    def _first(self, moment: Moment) -> Int64 | None:
-        plan = self._planner.plan(moment)
-        return None if plan.status == "infeasible" else choices(moment, order_of(plan))
+    def _firsts(self, view: View, moments: Sequence[Moment]) -> list[Int64 | None]:
+        """Of each moment, [N] what everybody goes for first; None where there is no plan."""
+        if self._choose is not None:
+            return [*self._choose([replace(view, moment=one, looks=()) for one in moments])]
+        plans = [self._planner.plan(moment) for moment in moments]
+        return [None if plan.status == "infeasible" else choices(moment, order_of(plan))
+                for moment, plan in zip(moments, plans, strict=True)]
 
 
 def with_hidden(view: View, coming: Sequence[Target]) -> tuple[Moment, Int64]:

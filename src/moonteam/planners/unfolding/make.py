@@ -29,7 +29,7 @@ PLACES = "places"
 """Places to look from are planned for as if they were targets."""
 STAY, MIDDLE = "stay", "middle"
 """Where nothing is hidden: where it is, or where the next target is soonest reached in the mean."""
-ALL_AT_ONCE = ("", STAY, MIDDLE, PLACES)
+ALL_AT_ONCE = ("", STAY, MIDDLE)
 """By which a policy can look ahead in the macro world."""
 MOST_FUTURES = 4096
 NEAR_M = 1e-6
@@ -105,7 +105,7 @@ def decider_of(planner: TimedPlanner, *, search: str = "", futures: int = 0,
         return Choosing(LookingAhead(planner.policy, futures, goal, seed,
                                      planner.preference).choose, replanning)
     if futures and search == PLACES:
-        return Choosing(Consensus(planner, futures, seed).choose, replanning)
+        return Choosing(Consensus(planner, futures, seed, choose).choose, replanning)
     if futures:
         return OverFutures(planner if choose is None else ExactPlanner(), futures, seed, pattern,
                            choose, goal)

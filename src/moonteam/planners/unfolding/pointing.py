@@ -61,7 +61,8 @@ def moments(views: Sequence[View]) -> tuple[MacroProblem, np.ndarray]:
 def problem_in(view: View) -> MacroProblem:
     """What is known as a problem of the macro world (NumPy arrays)."""
     problem = problem_of(view.moment)
-    return replace(problem, looks=np.arange(len(problem.looks)) >= len(view.targets))
+    column = np.arange(len(problem.looks)) - len(view.targets)
+    return replace(problem, looks=(column >= 0) & (column < len(view.looks)))
 
 
 def _bound(view: View) -> list[int]:
