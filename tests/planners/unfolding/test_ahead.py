@@ -18,7 +18,7 @@ from moonteam.planners.unfolding.ahead import LookingAhead, imagined, of_the_kno
 from moonteam.planners.unfolding.deciders import Replanning, play, play_together
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.pointing import Pointing, problem_in
-from moonteam.planners.unfolding.search import with_looks, without_posts
+from moonteam.planners.unfolding.search import with_looks, with_posts, without_posts
 from moonteam.planners.unfolding.world import World
 from moonteam.policies.pointer import grafted
 from moonteam.policies.policy import Policy
@@ -120,8 +120,9 @@ def test_the_plan_stands_among_what_is_tried_and_is_the_usual_where_it_is_for_wh
     assert len(np.unique(asked.tries, axis=0)) == len(asked.tries)
 
 
-def test_nobody_waits_for_a_place_to_look_from():
-    view = with_looks(World(missions("hidden", 1)[0]).view())
+def test_no_place_to_wait_at_waits_for_anybody():
+    view = with_posts(World(missions("arrivals", 1)[0]).view())
+    assert len(view.looks) == 5
     ahead = LookingAhead(POLICY, 2, "waiting")
     (asked,) = ahead._ask([view], 1, [None])
     first = len(view.targets) + len(view.looks)
