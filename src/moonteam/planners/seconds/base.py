@@ -159,7 +159,7 @@ def moment(timed: Timed, skills: Sequence[str] | None = None) -> Moment:
     def ms(a: tuple[float, float], b: tuple[float, float], speed: float) -> int:
         return round(MS * distance(a, b, timed.metric) / speed)
 
-    needs = [target.needs() for target in targets]
+    need, either = needs_of(targets, names)
     after = np.zeros((len(targets), len(targets)), bool)
     for j, target in enumerate(targets):
         after[j, list(target.after)] = True
@@ -173,9 +173,7 @@ def moment(timed: Timed, skills: Sequence[str] | None = None) -> Moment:
                           np.int64),
         classes=np.array([speeds.index(a.speed) for a in agents], np.int64),
         has=np.array([[s in a.skills for s in names] for a in agents], bool),
-        need=np.array([[need.get(s, 0) for s in names] for need in needs], np.int64).reshape(
-            count, len(names)),
-        either=np.array([t.type == "OR" and not t.coalition for t in targets], bool),
+        need=need, either=either,
         service=np.array([round(MS * t.service) for t in targets], np.int64),
         after=after,
         appears=np.array([opens(t) for t in targets], np.int64),
@@ -187,6 +185,14 @@ def moment(timed: Timed, skills: Sequence[str] | None = None) -> Moment:
         effort=np.ones(len(agents)),
         limit=NEVER if timed.max_seconds is None else round(MS * timed.max_seconds),
         worth=worth_of(targets))
+
+
+def needs_of(targets: Sequence[Target], names: Sequence[str]) -> tuple[Int64, Bools]:
+    """[M, S] how many of each skill targets need, and [M] whether anybody with one will do."""
+    asked = [target.needs() for target in targets]
+    need = np.array([[one.get(name, 0) for name in names] for one in asked], np.int64)
+    return need.reshape(len(targets), len(names)), np.array(
+        [target.type == "OR" and not target.coalition for target in targets], bool)
 
 
 class Needs(Protocol):

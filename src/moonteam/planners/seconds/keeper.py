@@ -64,6 +64,11 @@ def order_of(plan: TimedPlan) -> list[tuple[int, tuple[int, ...]]]:
     return [(one.target, one.agents) for one in plan.services]
 
 
+def first_moves(moment: Moment, plan: TimedPlan) -> npt.NDArray[np.int64] | None:
+    """[R] what a plan has everybody do first, see `choices`; None where it is none."""
+    return None if plan.status == "infeasible" else choices(moment, order_of(plan))
+
+
 def choices(moment: Moment, order: Sequence[tuple[int, tuple[int, ...]]]
             ) -> npt.NDArray[np.int64]:
     """[R] each robot's first open target in the order; HOME where it has none left."""

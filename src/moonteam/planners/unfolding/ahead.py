@@ -28,9 +28,9 @@ from moonteam.grid.macro import world
 from moonteam.grid.macro.draw import places
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.planners import macro
-from moonteam.planners.seconds.base import MS, Moment
+from moonteam.planners.seconds.base import MS, Moment, needs_of
 from moonteam.planners.seconds.exact import ExactPlanner
-from moonteam.planners.seconds.keeper import WAIT, choices, order_of
+from moonteam.planners.seconds.keeper import WAIT, first_moves
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.labels import MAX_AGENTS
 from moonteam.planners.unfolding.deciders import NOT_DONE, Goal, by_time
@@ -246,8 +246,7 @@ def of_the_known(moment: Moment) -> np.ndarray | None:
     count, agents = int((~moment.solved).sum()), len(moment.present)
     planner = ExactPlanner() if count <= EXACTLY and agents <= MAX_AGENTS else (
         LocalSearchPlanner(iterations=MOVES * count))
-    plan = planner.plan(moment)
-    return None if plan.status == "infeasible" else choices(moment, order_of(plan))
+    return first_moves(moment, planner.plan(moment))
 
 
 def raced(costs: np.ndarray, usual: bool) -> tuple[int, np.ndarray]:
@@ -299,10 +298,9 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     need[:, :len(open_)] = known.need[open_]
     under_way = int((view.moment.ends > 0).sum())
     for f, targets in enumerate(after):
+        need[f, len(open_):total, :len(state.names)], columns["either"][f, len(open_):total] = (
+            needs_of(targets, state.names))
         for k, target in enumerate(targets, len(open_)):
-            asks = target.needs()
-            need[f, k, :len(state.names)] = [asks.get(skill, 0) for skill in state.names]
-            columns["either"][f, k] = target.type == "OR" and not target.coalition
             columns["appears"][f, k] = columns["shown"][f, k] = max(target.appears - now, 0.0)
             columns["worth"][f, k] = target.worth
             if target.lapses is not None:

@@ -19,11 +19,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from moonteam.planners.seconds.base import Int64, Moment, TimedPlanner
-from moonteam.planners.seconds.keeper import WAIT, choices, order_of
+from moonteam.planners.seconds.base import Int64, Moment, TimedPlanner, needs_of
+from moonteam.planners.seconds.keeper import WAIT, first_moves
 from moonteam.planners.unfolding.deciders import Choose
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.search import with_more
+from moonteam.planners.unfolding.state import distances
 from moonteam.planners.unfolding.world import View
 from moonteam.problem.timed import Target
 
@@ -65,9 +66,7 @@ class Consensus:
         """Of each moment, [N] what everybody goes for first; None where there is no plan."""
         if self._choose is not None:
             return [*self._choose([replace(view, moment=one, looks=()) for one in moments])]
-        plans = [self._planner.plan(moment) for moment in moments]
-        return [None if plan.status == "infeasible" else choices(moment, order_of(plan))
-                for moment, plan in zip(moments, plans, strict=True)]
+        return [first_moves(moment, self._planner.plan(moment)) for moment in moments]
 
 
 def with_hidden(view: View, coming: Sequence[Target]) -> tuple[Moment, Int64]:
@@ -75,18 +74,14 @@ def with_hidden(view: View, coming: Sequence[Target]) -> tuple[Moment, Int64]:
     each of its columns the one to go to, which is that place for them.
     """
     count, names = len(view.moment.solved), view.state.names
-    need = np.zeros((len(coming), view.moment.need.shape[1]), np.int64)
-    after = np.zeros((len(coming), count), bool)
-    seen_from = np.arange(count + len(coming))
-    for row, target in enumerate(coming):
-        asks = target.needs()
-        need[row, :len(names)] = [asks.get(name, 0) for name in names]
-        gaps = [np.hypot(*(look.unseen - target.at).T).min() for look in view.looks]
-        seen_from[count + row] = len(view.targets) + int(np.argmin(gaps))
-        after[row, seen_from[count + row]] = True
-    either = np.array([target.type == "OR" and not target.coalition for target in coming], bool)
     spots = np.array([target.at for target in coming], float).reshape(-1, 2)
-    return with_more(view, spots, need, either, after), seen_from
+    points = np.concatenate([look.unseen for look in view.looks])
+    part = np.repeat(np.arange(len(view.looks)), [len(look.unseen) for look in view.looks])
+    sees = len(view.targets) + part[distances(spots, points, "straight").argmin(1)]
+    asked, either = needs_of(coming, names)
+    need = np.pad(asked, ((0, 0), (0, view.moment.need.shape[1] - len(names))))
+    after = sees[:, None] == np.arange(count)
+    return with_more(view, spots, need, either, after), np.append(np.arange(count), sees)
 
 
 def agreed(moves: Int64) -> Int64:

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, cast
 import numpy as np
 
 from moonteam.planners.seconds.base import MS, TimedPlanner
-from moonteam.planners.seconds.keeper import HOME, Keeper, choices, order_of
+from moonteam.planners.seconds.keeper import HOME, Keeper, choices, first_moves, order_of
 from moonteam.planners.unfolding.future import future
 from moonteam.planners.unfolding.ground import INSIDE
 from moonteam.planners.unfolding.search import Pattern, with_looks, with_posts
@@ -155,10 +155,9 @@ class OverFutures:
         view = world.revealed().view()
         if view.moment.solved.all():
             return None
-        plan = self._planner.plan(view.moment)
-        if plan.status == "infeasible":
+        chosen = first_moves(view.moment, self._planner.plan(view.moment))
+        if chosen is None:
             return None
-        chosen = choices(view.moment, order_of(plan))
         return [view.targets[j].at if j >= targets else int(j) for j in chosen.tolist()]
 
     def _play(self, worlds: Sequence[World], first: Sequence[Sequence[Order]]) -> None:
