@@ -41,7 +41,7 @@ _CHUNK = 4096  # episodes of a call, more only if one problem's tries are
 _LESS = 0.125  # of the preference, where what it asks for comes too late
 _AXES = {"start": "NM", "between": "NMM", "home": "NM", "home_now": "N", "has": "NS",
          "need": "MS", "either": "M", "service": "M", "after": "MM", "appears": "M",
-         "shown": "M", "following": "M", "sight": "MM", "looks": "M", "coming": "",
+         "shown": "M", "following": "M", "looks": "M", "unseen": "M", "coming": "",
          "middle": "M", "middle_now": "N",
          "lapses": "M", "worth": "M", "free": "N", "lost": "N", "effort": "N", "limit": "",
          "agent_mask": "N", "target_mask": "M", "unit": ""}

@@ -79,7 +79,8 @@ class Outlook:
     home: Array  # [B, N, M] time from the target home
     preference: Array  # [B] 0 time .. 1 effort
     ahead: Array | None = None
-    """[B, E, 3] log of how many come (0 of places to look from), time to where, both at once."""
+    """[B, E, 3] log of how many come (0 of places to look from), time to where, both at once (of
+    places to look from the share not seen)."""
     worth: Array | None = None  # [B, M] what serving it counts; 0: it has to be served
 
 
@@ -153,7 +154,8 @@ def _ahead(state: MacroState) -> Array:
     far = jnp.concatenate([agents, jnp.where(p.target_mask, p.middle, 0.0)]) / p.unit
     far = jnp.where(count > 0, jnp.minimum(far, LONG), 0.0)
     count = jnp.where(looks, 0.0, count)  # by which places to look from are told from targets
-    return jnp.stack([count, far, count * far], axis=-1)
+    unseen = jnp.concatenate([jnp.zeros(p.agent_mask.shape), p.unseen])
+    return jnp.stack([count, far, jnp.where(looks, unseen, count * far)], axis=-1)
 
 
 def _token_features(view: Outlook) -> tuple[Array, Array]:

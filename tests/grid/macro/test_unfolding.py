@@ -186,28 +186,3 @@ def test_who_waits_at_a_post_is_free_on_the_way_and_there():
         np.testing.assert_allclose(left, far[0] - passed, atol=2e-3)
     assert bool(world.free(after)[0])
     assert not bool(after.solved[post])
-
-
-def test_a_hidden_target_is_known_once_somebody_has_looked_from_near_it():
-    family = draw.Draw(targets=(4, 4), metric="straight", looks=4, limit=600.0)
-    problem = draw.draw(family, jax.random.key(5))
-    state = world.reset(problem)
-    entries = np.arange(family.entries)
-    far, looks = np.asarray(problem.between[0]), np.asarray(problem.looks)  # one cell a second
-    seen = np.asarray(problem.start).min(0) <= family.sensor  # from where they start
-    hidden = ~looks & ~seen
-    assert hidden.sum() >= 2
-    assert np.asarray(world.known(state))[~hidden].all()
-    assert not np.asarray(world.known(state))[hidden].any()
-    assert int(world.coming(state)) == hidden.sum()
-    for look in entries[looks]:
-        there = replace(state, solved=jnp.asarray(entries == look))
-        found = np.asarray(world.known(there))[hidden]
-        np.testing.assert_array_equal(found, far[look, hidden] <= family.sensor)
-    # When all are found nobody need look any more, and who serves them ends it.
-    spare = entries[looks & ~(far[:, hidden] <= family.sensor).any(1)][0]  # nothing is seen there
-    every = replace(state, solved=jnp.asarray(looks & (entries != spare)))
-    assert np.asarray(world.open_targets(state))[spare]
-    assert int(world.coming(every)) == 0
-    assert not np.asarray(world.open_targets(every))[spare]
-    assert bool(world.finished(replace(state, solved=jnp.asarray(~looks))))

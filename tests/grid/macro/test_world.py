@@ -135,7 +135,7 @@ def team(has, need, start, between, **changes):
         between=np.tile(np.array(between, np.float32), (n, 1, 1)),
         home=np.zeros((n, m), np.float32), home_now=np.zeros(n, np.float32), has=has, need=need,
         either=zero > 0, service=zero, after=np.zeros((m, m), bool), appears=zero, shown=zero,
-        following=np.zeros(m, np.int32), sight=np.zeros((m, m), bool), looks=zero > 0,
+        following=np.zeros(m, np.int32), looks=zero > 0, unseen=zero,
         coming=np.int32(0), middle=zero, worth=zero,
         middle_now=np.zeros(n, np.float32),
         lapses=zero + FAR, free=np.zeros(n, np.float32),

@@ -14,6 +14,7 @@ from jax import Array
 
 from moonteam import trees
 from moonteam.grid.config import EnvConfig
+from moonteam.grid.macro.sight import Sight, parts
 from moonteam.grid.macro.types import FAR, MacroProblem, plain
 from moonteam.grid.sampling import sample
 from moonteam.grid.types import Problem
@@ -220,7 +221,7 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
     if family.posts:
         made = replace(made, looks=jnp.arange(targets) >= family.entries - POSTS)
     if family.looks:
-        made = hidden(family, made, problem, cells)
+        made = hidden(family, made, problem, cells, speed)
     elif family.following:
         made = replace(made, following=jnp.where(late, turn, 0).astype(jnp.int32))
     else:
@@ -248,14 +249,21 @@ def lapsing(family: Draw, made: MacroProblem, real: Array, key: Array) -> MacroP
                    lapses=jnp.where(real, made.shown + stays, FAR))
 
 
-def hidden(family: Draw, made: MacroProblem, problem: Problem, cells: Array) -> MacroProblem:
-    """The problem, its targets to be seen from places to look from; those in sight are known."""
+def hidden(family: Draw, made: MacroProblem, problem: Problem, cells: Array,
+           speed: Array) -> MacroProblem:
+    """The problem, its targets to be seen on the way or from places to look from."""
     looks = jnp.arange(family.entries) >= family.targets[1]
-    far = apart(problem.target_cells, problem.target_cells, "straight")
-    sight = (far <= family.sensor) & looks[None] & ~looks[:, None] & made.target_mask[:, None]
-    seen = jnp.any((apart(cells, problem.target_cells, "straight") <= family.sensor)
-                   & made.agent_mask[:, None], axis=0)
-    return replace(made, looks=looks, sight=sight & ~seen[:, None])
+    points, padding = parts(family.sides[1], family.looks)
+    team = made.agent_mask
+    first = family.targets[1]
+    part = jnp.arange(family.entries)[None] == jnp.arange(first, first + len(points))[:, None]
+    return replace(made, looks=looks, sight=Sight(
+        at=problem.target_cells.astype(jnp.float32), hidden=made.target_mask & ~looks,
+        speed=jnp.where(team, speed, 1.0), reach=jnp.where(team, family.sensor, 0.0),
+        points=jnp.asarray(points), part=part, size=jnp.asarray((~padding).sum(1)),
+        seen=jnp.asarray(padding),
+        found=jnp.zeros(family.entries, bool), here=cells.astype(jnp.float32),
+        aim=cells.astype(jnp.float32)))
 
 
 def places(low: Any, high: Any, along: int = 8) -> Any:

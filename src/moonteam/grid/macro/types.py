@@ -13,6 +13,8 @@ from typing import Any
 import jax
 from jax import Array
 
+from moonteam.grid.macro.sight import Sight
+
 FAR = 1.0e9
 """s that stand for "no way" and "no limit"."""
 
@@ -37,8 +39,8 @@ class MacroProblem:
     appears: Array  # [M] s before which j does not start
     shown: Array  # [M] s before which nobody knows of j
     following: Array  # [M] int32, targets that are solved before anybody knows of j
-    sight: Array  # [M, M] bool, sight[j, k]: j is hidden, and seen from k once k is solved
     looks: Array  # [M] bool, of use while targets come: places to look from, or to wait at (posts)
+    unseen: Array  # [M] share of the ground looked at from there that nobody has seen
     coming: Array  # [] int32, targets still to be known of that have no entry here
     middle: Array  # [M] s from j to where targets may come, in the mean; 0 where nobody can say
     middle_now: Array  # [N] the same from where each agent starts
@@ -51,6 +53,8 @@ class MacroProblem:
     agent_mask: Array  # [N] bool
     target_mask: Array  # [M] bool
     unit: Array  # [] s by which times are divided where numbers of order one are wanted
+    sight: Sight | None = None
+    """Where targets are hidden: places, what robots see and have seen; then ways are straight."""
 
 
 def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: Any,
@@ -63,9 +67,8 @@ def plain(start: Any, between: Any, has: Any, need: Any, either: Any, *, limit: 
         start=start, between=between, home=xp.zeros((agents, targets), xp.float32),
         home_now=nobody, has=has, need=need, either=either, service=none,
         after=xp.zeros((targets, targets), bool), appears=none, shown=none,
-        following=xp.zeros(targets, xp.int32), sight=xp.zeros((targets, targets), bool),
-        looks=xp.zeros(targets, bool), coming=xp.zeros((), xp.int32), middle=none,
-        middle_now=nobody,
+        following=xp.zeros(targets, xp.int32), looks=xp.zeros(targets, bool), unseen=none,
+        coming=xp.zeros((), xp.int32), middle=none, middle_now=nobody,
         lapses=none + xp.float32(FAR), worth=none, free=nobody, lost=nobody + xp.float32(FAR),
         effort=nobody + 1, limit=limit,
         agent_mask=agent_mask, target_mask=target_mask, unit=unit)

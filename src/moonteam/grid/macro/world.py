@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam import trees
+from moonteam.grid.macro import sight
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroResult, MacroState
 
 NEAR = 0.5
@@ -34,6 +35,8 @@ SOON = 5e-4
 def reset(problem: MacroProblem) -> MacroState:
     """The first moment at which somebody can decide."""
     problem = trees.single(problem)
+    if problem.sight is not None:
+        problem = replace(problem, sight=sight.begun(problem.sight))
     agents, targets = problem.start.shape
     none, zero = jnp.full(agents, targets, jnp.int32), jnp.zeros(agents, jnp.float32)
     start = MacroState(
@@ -73,8 +76,8 @@ def known(state: MacroState) -> Array:
     """[M] bool: somebody knows of it, be it solved or not."""
     problem = state.problem
     count = jnp.sum(state.solved & ~state.lapsed & problem.target_mask & ~problem.looks)
-    found = jnp.any(problem.sight & state.solved[None], axis=1) | ~jnp.any(problem.sight, axis=1)
-    return (state.now >= problem.shown - SOON) & (problem.following <= count) & found
+    shown = (state.now >= problem.shown - SOON) & (problem.following <= count)
+    return shown if problem.sight is None else shown & (~problem.sight.hidden | problem.sight.found)
 
 
 def open_targets(state: MacroState) -> Array:
@@ -207,9 +210,15 @@ def step(state: MacroState, choice: Array) -> MacroResult:
     going = free(state) & (choice < targets)
     index = jnp.minimum(choice, targets - 1)
     leg = jnp.take_along_axis(legs(problem, state.node), index[:, None], axis=1)[:, 0]
+    if problem.sight is not None:
+        aim = sight.aimed(problem.sight, choice)
+        leg = jnp.linalg.norm(aim - problem.sight.here, axis=1) / problem.sight.speed
+        aim = jnp.where(going[:, None], aim, problem.sight.aim)
+        problem = replace(problem, sight=replace(problem.sight, aim=aim))
     leg = jnp.where(going, leg, 0.0)
     out = replace(
-        state, goal=jnp.where(going, choice, state.goal), node=jnp.where(going, choice, state.node),
+        state, problem=problem, goal=jnp.where(going, choice, state.goal),
+        node=jnp.where(going, choice, state.node),
         origin=jnp.where(going, state.node, state.origin), leg=jnp.where(going, leg, state.leg),
         busy=jnp.where(going, leg, state.busy), travelled=state.travelled + leg)
     after, dead = _run(out, jnp.array(False))
@@ -252,10 +261,25 @@ def loosen(state: MacroState, who: Array) -> MacroState:
                   home_now=jnp.where(who, home, problem.home_now),
                   middle_now=jnp.where(who, middle, problem.middle_now))
     travelled = state.travelled - jnp.where(who, rest, 0.0)
-    return replace(
+    return _placed(replace(
         state, problem=out, travelled=travelled, node=jnp.where(who, targets, state.node),
         goal=jnp.where(who, targets, state.goal), busy=jnp.where(who, 0.0, state.busy),
-        since=jnp.where(who, state.now, state.since))
+        since=jnp.where(who, state.now, state.since)))
+
+
+def _placed(state: MacroState) -> MacroState:
+    """The state with the ways as they are now, where targets are hidden: whoever is free starts
+    where it is, and places to look from move with what is left to see.
+    """
+    problem, targets = state.problem, state.solved.shape[0]
+    if problem.sight is None:
+        return state
+    start, between = sight.ways(problem.sight)
+    middle, middle_now = sight.middles(problem.sight)
+    return replace(
+        state, problem=replace(problem, start=start, between=between, middle=middle,
+                               middle_now=middle_now, unseen=problem.sight.unseen),
+        node=jnp.where(state.goal == targets, targets, state.node))
 
 
 def along(near: Array, far: Array, gone: Array, rest: Array) -> Array:
@@ -305,7 +329,7 @@ def _run(state: MacroState, moved: Array) -> tuple[MacroState, Array]:
     first, again = begun(state)
     start = first, jnp.array(False), moved | again, again
     state, dead, _, _ = jax.lax.while_loop(waits, event, start)
-    return state, dead
+    return _placed(state), dead
 
 
 def _start(state: MacroState) -> MacroState:
@@ -352,7 +376,10 @@ def _advance(state: MacroState) -> tuple[MacroState, Array, Array]:
     ends = problem.lapses - state.now + 2 * SOON
     ends = jnp.where(optional & pending & (problem.lapses < FAR / 2), jnp.maximum(ends, 0.0), FAR)
     rest = jnp.min(jnp.where(stands, FAR, arrivals))
-    wait = jnp.minimum(jnp.minimum(rest, jnp.min(opens)),
+    moving = (arrivals < FAR) & (state.goal < targets) & ~state.serving[here]
+    finds = FAR if problem.sight is None else sight.first_find(
+        problem.sight, state.busy, moving, FAR)
+    wait = jnp.minimum(jnp.minimum(jnp.minimum(rest, finds), jnp.min(opens)),
                        jnp.minimum(jnp.min(news), jnp.minimum(jnp.min(losses), jnp.min(ends))))
     there = jnp.min(jnp.where(stands, arrivals, FAR))
     quiet = there < wait - SOON
@@ -373,13 +400,19 @@ def _advance(state: MacroState) -> tuple[MacroState, Array, Array]:
     released = (state.busy > 0) & (busy <= 0) & ~bound  # of those that could not yet set out
     lapses = optional & pending & (now > problem.lapses + SOON)
     lapsed = state.lapsed | lapses
-    vain = bound & (busy <= 0) & (lapsed[here] | stands)  # waits for nothing there
+    found, looked = jnp.array(False), jnp.zeros(targets, bool)
+    if problem.sight is not None:
+        seen = sight.gone_on(problem.sight, state.busy, moving, wait)
+        found, looked = jnp.any(seen.found & ~problem.sight.found), seen.looked
+        problem, lapses = replace(problem, sight=seen), lapses | looked
+    vain = bound & (busy <= 0) & (lapsed[here] | stands | looked[here])  # waits for nothing there
     after = replace(
-        state, now=now, busy=busy, serving=state.serving & ~ended,
+        state, problem=problem, now=now, busy=busy, serving=state.serving & ~ended,
         solved=state.solved | ended | lapses, lapsed=lapsed,
         goal=jnp.where(finished | vain, targets, state.goal),
         since=jnp.where(finished | released | vain, now, state.since))
-    return _without_lost(loosen(after, bound & lapsed[here])), dead, quiet
+    # Whatever is found may concern everybody.
+    return _without_lost(loosen(after, (bound & lapsed[here]) | found)), dead, quiet
 
 
 def _without_lost(state: MacroState) -> MacroState:

@@ -29,8 +29,8 @@ def problem_of(now: Moment) -> MacroProblem:
         "home": _seconds(now.home), "home_now": _seconds(now.home_now), "has": has, "need": need,
         "either": now.either, "service": _seconds(now.service), "after": now.after,
         "appears": _seconds(np.maximum(now.appears, under_way)), "shown": zero,
-        "following": np.zeros(len(zero), np.int32), "sight": np.zeros_like(now.after),
-        "looks": np.zeros(len(zero), bool), "coming": np.int32(now.coming),
+        "following": np.zeros(len(zero), np.int32),
+        "looks": np.zeros(len(zero), bool), "unseen": zero, "coming": np.int32(now.coming),
         "middle": zero if now.middle is None else _seconds(now.middle),
         "middle_now": np.zeros(len(start), np.float32) if now.middle_now is None
         else _seconds(now.middle_now),

@@ -26,6 +26,7 @@ from jax import Array
 from moonteam import trees
 from moonteam.grid.macro import world
 from moonteam.grid.macro.draw import places
+from moonteam.grid.macro.sight import INSIDE, Sight
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
 from moonteam.planners import macro
 from moonteam.planners.seconds.base import MS, Moment, needs_of
@@ -230,7 +231,7 @@ class LookingAhead:
         for at in range(0, len(row), rows):
             own = np.minimum(np.arange(at, at + rows), len(row) - 1)
             part = jax.tree.map(lambda x, own=own: x[row[own]], problems)
-            found.append(_played(self._spec, self._params, part, bound[own],
+            found.append(played_out(self._spec, self._params, part, bound[own],
                                  first[own].astype(np.int32), self._preference))
         return tuple(np.concatenate(x)[:len(row)].astype(np.float64)
                      for x in zip(*jax.device_get(found), strict=True))
@@ -334,8 +335,38 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
                  "coming"):
         value = np.asarray(getattr(known, name))
         columns[name] = np.broadcast_to(value, (count, *value.shape))
-    columns |= {"coming": np.zeros(count, np.int32), "sight": np.zeros_like(waits)}
-    return MacroProblem(**columns)
+    columns["coming"] = np.zeros(count, np.int32)
+    columns["unseen"] = np.zeros((count, size), np.float32)
+    hidden = (np.arange(size) >= len(open_)) & there
+    return MacroProblem(**columns, sight=_sight(view, spots, hidden, open_))
+
+
+def _sight(view: View, spots: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> Sight | None:
+    """[F] what robots see in futures with everything at `spots` [F, T, 2], some of it `hidden` [T];
+    None where nothing is.
+    """
+    if view.ground is None or not view.coming or not view.looks:
+        return None
+    count, size = spots.shape[:2]
+    reach = [agent.sensor or 0.0 for agent in view.agents]
+    rows, columns = view.ground.cuts(INSIDE * min(r for r in reach if r))
+    most = len(rows) * len(columns), max(map(len, rows)) * max(map(len, columns))
+    across = len(view.looks)
+    points = np.zeros((*most, 2), np.float32)
+    seen, part = np.ones(most, bool), np.zeros((most[0], size), bool)
+    full = np.zeros(most[0], np.int32)
+    for k, look in enumerate(view.looks):
+        points[k, :len(look.unseen)], seen[k, :len(look.unseen)] = look.unseen, False
+        full[k] = round(len(look.unseen) / look.share)
+    part[np.arange(across), np.searchsorted(open_, len(view.targets) + np.arange(across))] = True
+    here = view.places.astype(np.float32)
+    speed = [agent.speed for agent in view.agents]
+    alike = {"hidden": hidden, "speed": np.array(speed, np.float32),
+             "reach": np.where(view.moment.present, reach, 0.0).astype(np.float32),
+             "points": points, "part": part, "size": full, "seen": seen,
+             "found": np.zeros(size, bool), "here": here, "aim": here}
+    return Sight(at=spots.astype(np.float32), **{
+        name: np.broadcast_to(value, (count, *value.shape)) for name, value in alike.items()})
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -353,7 +384,7 @@ def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
 
 
 @partial(jax.jit, static_argnames="spec")
-def _played(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, first: Array,
+def played_out(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, first: Array,
             preference: Array) -> tuple[Array, Array, Array]:
     """[R] s from now to the end, if the team does `first` [R, N] and then what is likeliest; [R, T]
     s at which each service starts; and [R] the worth of what never is served.

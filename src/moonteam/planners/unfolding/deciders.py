@@ -12,10 +12,10 @@ from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 
+from moonteam.grid.macro.sight import INSIDE
 from moonteam.planners.seconds.base import MS, TimedPlanner
 from moonteam.planners.seconds.keeper import HOME, Keeper, choices, first_moves, order_of
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.ground import INSIDE
 from moonteam.planners.unfolding.search import Pattern, with_looks, with_posts
 from moonteam.planners.unfolding.state import Order
 from moonteam.planners.unfolding.world import View, World

@@ -16,9 +16,6 @@ from moonteam.problem.timed import Place, Timed
 
 Floats = npt.NDArray[np.float64]
 
-INSIDE = 0.98
-"""Share of a sensor's reach from which a point is looked at."""
-
 
 @dataclass(frozen=True)
 class Look:
@@ -26,6 +23,7 @@ class Look:
 
     at: Place
     unseen: Floats  # [U, 2] m
+    share: float = 0.0  # of the part, what is not seen
 
     def from_afar(self, here: Floats, reach: float) -> Place:
         """The first place, to a hair, on the straight way there from which it is all in reach."""
@@ -80,19 +78,24 @@ class Ground:
         """[U, 2] m."""
         return self.points[~self.seen]
 
-    def looks(self, reach: float) -> list[Look]:
-        """Places to look from: the middles of equal parts, each to be seen whole from there."""
+    def cuts(self, reach: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The rows and the columns of equal parts, each to be seen whole from its middle."""
         size = self.points[-1, -1] - self.points[0, 0]
         wide, high = (max(1, math.ceil(v / (math.sqrt(2) * reach))) for v in size.tolist())
         rows, columns = (np.array_split(np.arange(n), parts) for n, parts in zip(
             self.seen.shape, (high, wide), strict=True))
+        return rows, columns
+
+    def looks(self, reach: float) -> list[Look]:
+        """Places to look from: the middles of those parts of which not all has been seen."""
         found = []
-        for own in itertools.product(rows, columns):
+        for own in itertools.product(*self.cuts(reach)):
             part = np.ix_(*own)
             unseen = self.points[part][~self.seen[part]]
             if len(unseen):
                 x, y = (unseen.min(0) + unseen.max(0)) / 2
-                found.append(Look((float(x), float(y)), unseen))
+                found.append(Look((float(x), float(y)), unseen,
+                                  len(unseen) / self.seen[part].size))
         return found
 
     def see(self, way: Floats, reach: float) -> None:

@@ -62,7 +62,10 @@ def problem_in(view: View) -> MacroProblem:
     """What is known as a problem of the macro world (NumPy arrays)."""
     problem = problem_of(view.moment)
     column = np.arange(len(problem.looks)) - len(view.targets)
-    return replace(problem, looks=(column >= 0) & (column < len(view.looks)))
+    looks = (column >= 0) & (column < len(view.looks))
+    unseen = np.zeros(len(looks), np.float32)
+    unseen[looks] = [look.share for look in view.looks]
+    return replace(problem, looks=looks, unseen=unseen)
 
 
 def _bound(view: View) -> list[int]:

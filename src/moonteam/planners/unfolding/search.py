@@ -12,8 +12,9 @@ from typing import Protocol
 import numpy as np
 
 from moonteam.grid.macro.draw import places, post_places
+from moonteam.grid.macro.sight import INSIDE
 from moonteam.planners.seconds.base import NEVER, Int64, Moment
-from moonteam.planners.unfolding.ground import INSIDE, Look, Post
+from moonteam.planners.unfolding.ground import Look, Post
 from moonteam.planners.unfolding.state import distances, ms
 from moonteam.planners.unfolding.world import View
 from moonteam.problem.timed import Place
