@@ -7,7 +7,7 @@ import msgspec
 from moonteam.errors import InputError
 from moonteam.planners.seconds.base import TimedPlanner
 from moonteam.planners.seconds.keeper import MARGIN_MS, Keeper
-from moonteam.planners.unfolding.make import (
+from moonteam.planners.unfolding.deciding.make import (
     PLACES,
     Search,
     check_futures,

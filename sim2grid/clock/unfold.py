@@ -17,7 +17,7 @@ import numpy as np
 
 from moonteam.planners.seconds.base import MS, Bools, Moment
 from moonteam.planners.seconds.keeper import WAIT
-from moonteam.planners.unfolding.deciders import Decider
+from moonteam.planners.unfolding.deciding.deciders import Decider
 from moonteam.planners.unfolding.ground import Ground
 from moonteam.planners.unfolding.state import Body, Order, Outcome, State
 from moonteam.planners.unfolding.world import View

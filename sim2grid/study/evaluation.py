@@ -38,7 +38,7 @@ from moonteam.planners.kind import DEFAULT_POLICY, PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.base import MS, Moment
 from moonteam.planners.seconds.keeper import Keeper
-from moonteam.planners.unfolding.make import Search, check_futures
+from moonteam.planners.unfolding.deciding.make import Search, check_futures
 from moonteam.policies.brain import PointerBrain
 from moonteam.problem.mission import Mission
 from moonteam.report.progress import bar

@@ -91,7 +91,7 @@ def _missions(args: Args) -> tuple[list[Timed], bool, bool]:
 
     Raises InputError.
     """
-    from moonteam.planners.unfolding.make import check_search
+    from moonteam.planners.unfolding.deciding.make import check_search
 
     found = [one for one in load_any(args.set, args.limit) if isinstance(one, Timed)]
     if not found:
@@ -111,7 +111,7 @@ def run(args: Args) -> int:
     """Plays, compares, prints, saves; 0 whatever the planners achieved, 130 if interrupted."""
     compilation.enable_cache()
     from moonteam.evaluation import timed, unfolding
-    from moonteam.planners.unfolding.make import PATTERNS
+    from moonteam.planners.unfolding.deciding.make import PATTERNS
     from moonteam.report import command, journal
 
     found, hidden, ahead = _missions(args)

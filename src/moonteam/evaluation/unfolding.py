@@ -20,8 +20,8 @@ from moonteam.errors import InputError
 from moonteam.evaluation import timed as by_clock
 from moonteam.planners.seconds.base import MS, TimedPlanner, enough, moment
 from moonteam.planners.seconds.policy import PolicyPlanner
-from moonteam.planners.unfolding.ahead import LookingAhead
-from moonteam.planners.unfolding.deciders import (
+from moonteam.planners.unfolding.deciding.ahead import LookingAhead
+from moonteam.planners.unfolding.deciding.deciders import (
     GOALS,
     Choose,
     Decider,
@@ -31,7 +31,7 @@ from moonteam.planners.unfolding.deciders import (
     play,
     play_together,
 )
-from moonteam.planners.unfolding.make import (
+from moonteam.planners.unfolding.deciding.make import (
     ALL_AT_ONCE,
     PLACES,
     STAY,

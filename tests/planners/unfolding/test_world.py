@@ -10,9 +10,9 @@ from moonteam import loading, paths
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.unfolding import draw
-from moonteam.planners.unfolding.deciders import Decider, OverFutures, Replanning
+from moonteam.planners.unfolding.deciding.deciders import Decider, OverFutures, Replanning
+from moonteam.planners.unfolding.deciding.search import Middle, NearestUnseen, Sweep
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.search import Middle, NearestUnseen, Sweep
 from moonteam.planners.unfolding.world import World
 from moonteam.problem import timed
 from moonteam.problem.timed import Agent, Loss, Prospect, Target, Timed

@@ -1,1 +1,1 @@
-"""Missions that unfold: a world that keeps what nobody knows yet, and who decides in it."""
+"""Missions that unfold: a world that keeps what nobody knows yet; `deciding` in it is apart."""

@@ -19,26 +19,23 @@ from functools import partial
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from moonteam import trees
 from moonteam.grid.macro import world
-from moonteam.grid.macro.draw import places
-from moonteam.grid.macro.sight import INSIDE, Sight
-from moonteam.grid.macro.types import FAR, MacroProblem, MacroState
+from moonteam.grid.macro.types import MacroProblem, MacroState
 from moonteam.planners import macro
-from moonteam.planners.seconds.base import MS, Moment, needs_of
+from moonteam.planners.seconds.base import MS, Moment
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.keeper import WAIT, first_moves
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.labels import MAX_AGENTS
-from moonteam.planners.unfolding.deciders import NOT_DONE, Goal, by_time
-from moonteam.planners.unfolding.future import Future, future, may_lose
-from moonteam.planners.unfolding.pointing import begun, moments, problem_in, said
-from moonteam.planners.unfolding.search import posts, without_posts
-from moonteam.planners.unfolding.state import distances
+from moonteam.planners.unfolding.deciding.deciders import Goal, by_time
+from moonteam.planners.unfolding.deciding.imagined import imagined
+from moonteam.planners.unfolding.deciding.pointing import begun, moments, said
+from moonteam.planners.unfolding.deciding.rollouts import rolled_out
+from moonteam.planners.unfolding.deciding.search import posts, without_posts
+from moonteam.planners.unfolding.future import future, may_lose
 from moonteam.planners.unfolding.world import View
 from moonteam.policies.pointer import PointerSpec
 from moonteam.policies.policy import Policy
@@ -57,10 +54,6 @@ SURE = 2.0
 """Standard errors behind the best at which a try drops out."""
 FEWEST = 4
 """T at least: programs for fewer would be compiled in vain."""
-FEW, ROWS = 64, 512
-"""R, of few rollouts and of many."""
-LONGEST = 64
-"""Decisions after which a rollout is given up."""
 
 
 @dataclass(frozen=True)
@@ -184,13 +177,14 @@ class LookingAhead:
 
         So many as `count`, but one where nothing is drawn.
         """
-        alike: dict[tuple[int, ...], list[int]] = {}
+        alike: dict[tuple, list[int]] = {}
         for b in left:
             coming = asked[b].view.coming
             size = max(FEWEST, macro.padded(len(asked[b].open_) + coming))
             team = asked[b].view.moment.has.shape
             some = count if coming or may_lose(asked[b].view) else 1
-            alike.setdefault((size, some, *team), []).append(b)
+            hidden = bool(coming and asked[b].view.looks)
+            alike.setdefault((size, some, *team, hidden), []).append(b)
         found = {}
         for (size, some, *_), missions in alike.items():
             problems, rows, firsts, bounds = [], [], [], []
@@ -204,9 +198,11 @@ class LookingAhead:
                 firsts.append(np.repeat(np.where(tries < len(one.open_), tries, size), some, 0))
                 bounds.append(np.tile(one.bound, (len(tries) * some, 1)))
             whole: MacroProblem = jax.tree.map(lambda *x: np.concatenate(x), *problems)
-            played = self._rolled(whole, *(np.concatenate(x) for x in (rows, firsts, bounds)))
+            row, first, bound = (np.concatenate(x) for x in (rows, firsts, bounds))
+            done = rolled_out(self._spec, self._params, whole, row, first, bound,
+                              self._preference)
             ends = np.cumsum([len(row) for row in rows])[:-1]
-            for b, *own in zip(missions, *(np.split(x, ends) for x in played), strict=True):
+            for b, *own in zip(missions, *(np.split(x, ends) for x in done), strict=True):
                 found[b] = self._cost(asked[b], *own).reshape(-1, some)
         return found
 
@@ -221,20 +217,6 @@ class LookingAhead:
             return span
         first, targets = len(asked.open_), np.flatnonzero(asked.open_ < len(asked.view.targets))
         return served[:, [*targets, *range(first, first + asked.view.coming)]].sum(1)
-
-    def _rolled(self, problems: MacroProblem, row: np.ndarray, first: np.ndarray,
-                bound: np.ndarray) -> tuple[np.ndarray, ...]:
-        """[rollouts] s to the end, [rollouts, T] s to each service and [rollouts] worth not
-        served; of each its problem's row, what everybody does first, who is bound.
-        """
-        found, rows = [], ROWS if len(row) > 2 * FEW else FEW
-        for at in range(0, len(row), rows):
-            own = np.minimum(np.arange(at, at + rows), len(row) - 1)
-            part = jax.tree.map(lambda x, own=own: x[row[own]], problems)
-            found.append(played_out(self._spec, self._params, part, bound[own],
-                                 first[own].astype(np.int32), self._preference))
-        return tuple(np.concatenate(x)[:len(row)].astype(np.float64)
-                     for x in zip(*jax.device_get(found), strict=True))
 
 
 def sure(view: View) -> bool:
@@ -267,108 +249,6 @@ def raced(costs: np.ndarray, usual: bool) -> tuple[int, np.ndarray]:
     return best, stays
 
 
-def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
-    """[F] the mission from now on in each of these futures, padded to `size` targets.
-
-    NumPy arrays. A target that comes is known of when it comes, as in the mission; whose service
-    is under way counts as solved.
-    """
-    known, state = problem_in(view), view.state
-    open_ = np.flatnonzero(~view.moment.solved)
-    count, coming, team = len(futures), view.coming, len(view.places)
-    total = len(open_) + coming
-    spots = np.zeros((count, size, 2))
-    known_at = np.array([*(t.at for t in view.targets), *(look.at for look in view.looks)], float)
-    spots[:, :len(open_)] = known_at.reshape(-1, 2)[open_]
-    after = [one.coming for one in futures]
-    spots[:, len(open_):total] = np.array([[t.at for t in ts] for ts in after],
-                                          float).reshape(count, coming, 2)
-    there = np.arange(size) < total
-    speed = np.array([agent.speed for agent in view.agents])
-    metric = state.problem.metric
-    far = distances(spots, spots, metric)
-    both = there[:, None] & there[None]
-    now = view.now / MS
-    need = np.zeros((count, size, known.need.shape[1]), np.int32)
-    columns: dict[str, Any] = {"need": need}
-    for name in ("either", "service", "appears", "lapses", "worth", "shown", "following", "looks"):
-        values = np.asarray(getattr(known, name))
-        column = np.full((count, size), FAR if name == "lapses" else 0, values.dtype)
-        column[:, :len(open_)] = values[open_]
-        columns[name] = column
-    need[:, :len(open_)] = known.need[open_]
-    under_way = int((view.moment.ends > 0).sum())
-    for f, targets in enumerate(after):
-        need[f, len(open_):total, :len(state.names)], columns["either"][f, len(open_):total] = (
-            needs_of(targets, state.names))
-        for k, target in enumerate(targets, len(open_)):
-            columns["appears"][f, k] = columns["shown"][f, k] = max(target.appears - now, 0.0)
-            columns["worth"][f, k] = target.worth
-            if target.lapses is not None:
-                columns["lapses"][f, k] = max(target.lapses - now, 0.0)
-            columns["following"][f, k] = max(target.following - view.ended - under_way, 0)
-    waits = np.zeros((count, size, size), bool)
-    waits[:, :len(open_), :len(open_)] = known.after[np.ix_(open_, open_)]
-    area = None if state.problem.expects is None else state.problem.expects.area
-    middle = np.zeros((count, size))
-    if coming and area is not None:
-        spread = places(np.array(area[:2]), np.array(area[2:]))
-        middle = distances(spots, spread, metric).mean(-1) / speed.max() * there
-    has = np.asarray(known.has)
-    start = np.full((count, team, size), FAR, np.float32)
-    home = np.zeros((count, team, size), np.float32)
-    here = distances(view.places, spots, metric) / speed[:, None]
-    start[:, :, :total] = here[:, :, :total]
-    for i, agent in enumerate(view.agents):
-        if agent.home is not None:
-            way = distances(spots, np.array([agent.home], float), metric)[..., 0]
-            home[:, i] = way / agent.speed * there
-    columns |= {
-        "start": start, "home": home, "after": waits, "middle": middle.astype(np.float32),
-        "between": np.where(both, far[:, None] / speed[:, None, None], FAR).astype(np.float32),
-        "target_mask": np.broadcast_to(there, (count, size)),
-        "unit": np.array([macro.unit_of(a, has, b) for a, b in zip(start, need, strict=True)],
-                         np.float32)}
-    gone = [[FAR if t is None else t - now for t in one.lost] for one in futures]
-    columns["lost"] = np.array(gone, np.float32)
-    for name in ("home_now", "has", "free", "effort", "limit", "agent_mask", "middle_now",
-                 "coming"):
-        value = np.asarray(getattr(known, name))
-        columns[name] = np.broadcast_to(value, (count, *value.shape))
-    columns["coming"] = np.zeros(count, np.int32)
-    columns["unseen"] = np.zeros((count, size), np.float32)
-    hidden = (np.arange(size) >= len(open_)) & there
-    return MacroProblem(**columns, sight=_sight(view, spots, hidden, open_))
-
-
-def _sight(view: View, spots: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> Sight | None:
-    """[F] what robots see in futures with everything at `spots` [F, T, 2], some of it `hidden` [T];
-    None where nothing is.
-    """
-    if view.ground is None or not view.coming or not view.looks:
-        return None
-    count, size = spots.shape[:2]
-    reach = [agent.sensor or 0.0 for agent in view.agents]
-    rows, columns = view.ground.cuts(INSIDE * min(r for r in reach if r))
-    most = len(rows) * len(columns), max(map(len, rows)) * max(map(len, columns))
-    across = len(view.looks)
-    points = np.zeros((*most, 2), np.float32)
-    seen, part = np.ones(most, bool), np.zeros((most[0], size), bool)
-    full = np.zeros(most[0], np.int32)
-    for k, look in enumerate(view.looks):
-        points[k, :len(look.unseen)], seen[k, :len(look.unseen)] = look.unseen, False
-        full[k] = round(len(look.unseen) / look.share)
-    part[np.arange(across), np.searchsorted(open_, len(view.targets) + np.arange(across))] = True
-    here = view.places.astype(np.float32)
-    speed = [agent.speed for agent in view.agents]
-    alike = {"hidden": hidden, "speed": np.array(speed, np.float32),
-             "reach": np.where(view.moment.present, reach, 0.0).astype(np.float32),
-             "points": points, "part": part, "size": full, "seen": seen,
-             "found": np.zeros(size, bool), "here": here, "aim": here}
-    return Sight(at=spots.astype(np.float32), **{
-        name: np.broadcast_to(value, (count, *value.shape)) for name, value in alike.items()})
-
-
 @partial(jax.jit, static_argnames="spec")
 def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, seeds: Array,
            preference: Array) -> Array:
@@ -381,33 +261,3 @@ def _drawn(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array,
         return jax.vmap(lambda own: world.choose(state, logits, own)[0])(noise.at[0].set(0.0))
 
     return cast(Array, jax.vmap(tried)(states, logits, seeds))
-
-
-@partial(jax.jit, static_argnames="spec")
-def played_out(spec: PointerSpec, params: Any, problems: MacroProblem, bound: Array, first: Array,
-            preference: Array) -> tuple[Array, Array, Array]:
-    """[R] s from now to the end, if the team does `first` [R, N] and then what is likeliest; [R, T]
-    s at which each service starts; and [R] the worth of what never is served.
-    """
-    begin = begun(problems, bound)
-    worst = NOT_DONE * problems.limit
-
-    def go(carry: tuple, choice: Array) -> tuple:
-        states, over, cost, turn = carry
-        result = jax.vmap(world.step)(states, choice)
-        after = jax.vmap(world.loosen)(result.state, jnp.ones(choice.shape, bool))
-        end = jnp.where(result.terminated, states.now + result.seconds, worst)
-        ended = over | result.terminated | result.truncated
-        cost = jnp.where(ended & ~over, end, cost)
-        return trees.where(over, states, after), ended, cost, turn + 1
-
-    def likeliest(carry: tuple) -> tuple:
-        logits = said(spec, params, carry[0], preference)
-        return go(carry, jax.vmap(world.choose)(carry[0], logits, jnp.zeros_like(logits))[0])
-
-    start = go((begin, jnp.zeros(first.shape[0], bool), worst, 0), first)
-    end, _, cost, _ = jax.lax.while_loop(
-        lambda carry: jnp.any(~carry[1]) & (carry[3] < LONGEST), likeliest, start)
-    late = end.lapsed | (~end.solved & ~end.serving)
-    missed = jnp.sum(jnp.where(late, end.problem.worth, 0.0), axis=1)
-    return cost, jnp.where(late, worst[:, None], end.served), missed

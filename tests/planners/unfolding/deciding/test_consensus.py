@@ -10,12 +10,12 @@ from moonteam.planners.kind import PlannerOptions
 from moonteam.planners.seconds import registry as timed_planners
 from moonteam.planners.seconds.keeper import HOME, choices, order_of
 from moonteam.planners.seconds.local import LocalSearchPlanner
-from moonteam.planners.unfolding.consensus import Consensus, agreed, with_hidden
-from moonteam.planners.unfolding.deciders import play
+from moonteam.planners.unfolding.deciding.consensus import Consensus, agreed, with_hidden
+from moonteam.planners.unfolding.deciding.deciders import play
+from moonteam.planners.unfolding.deciding.make import PLACES, decider_of
+from moonteam.planners.unfolding.deciding.pointing import Pointing
+from moonteam.planners.unfolding.deciding.search import with_looks
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.make import PLACES, decider_of
-from moonteam.planners.unfolding.pointing import Pointing
-from moonteam.planners.unfolding.search import with_looks
 from moonteam.planners.unfolding.world import World
 from moonteam.problem import timed
 from moonteam.problem.timed import Agent, Prospect, Target, Timed

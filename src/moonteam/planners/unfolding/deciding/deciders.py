@@ -15,8 +15,8 @@ import numpy as np
 from moonteam.grid.macro.sight import INSIDE
 from moonteam.planners.seconds.base import MS, TimedPlanner
 from moonteam.planners.seconds.keeper import HOME, Keeper, choices, first_moves, order_of
+from moonteam.planners.unfolding.deciding.search import Pattern, with_looks, with_posts
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.search import Pattern, with_looks, with_posts
 from moonteam.planners.unfolding.state import Order
 from moonteam.planners.unfolding.world import View, World
 

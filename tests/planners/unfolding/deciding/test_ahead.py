@@ -14,11 +14,17 @@ from moonteam.planners.seconds.greedy import GreedyPlanner
 from moonteam.planners.seconds.keeper import choices, order_of
 from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.macro import problem_of
-from moonteam.planners.unfolding.ahead import LookingAhead, imagined, of_the_known, raced, sure
-from moonteam.planners.unfolding.deciders import Replanning, play, play_together
+from moonteam.planners.unfolding.deciding.ahead import (
+    LookingAhead,
+    of_the_known,
+    raced,
+    sure,
+)
+from moonteam.planners.unfolding.deciding.deciders import Replanning, play, play_together
+from moonteam.planners.unfolding.deciding.imagined import imagined
+from moonteam.planners.unfolding.deciding.pointing import Pointing, problem_in
+from moonteam.planners.unfolding.deciding.search import with_looks, with_posts, without_posts
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.pointing import Pointing, problem_in
-from moonteam.planners.unfolding.search import with_looks, with_posts, without_posts
 from moonteam.planners.unfolding.world import World
 from moonteam.policies.pointer import grafted
 from moonteam.policies.policy import Policy

@@ -21,9 +21,9 @@ import numpy as np
 
 from moonteam.planners.seconds.base import Int64, Moment, TimedPlanner, needs_of
 from moonteam.planners.seconds.keeper import WAIT, first_moves
-from moonteam.planners.unfolding.deciders import Choose
+from moonteam.planners.unfolding.deciding.deciders import Choose
+from moonteam.planners.unfolding.deciding.search import with_more
 from moonteam.planners.unfolding.future import future
-from moonteam.planners.unfolding.search import with_more
 from moonteam.planners.unfolding.state import distances
 from moonteam.planners.unfolding.world import View
 from moonteam.problem.timed import Target

@@ -6,11 +6,12 @@ import pytest
 from moonteam import loading, paths
 from moonteam.planners import macro
 from moonteam.planners.seconds.exact import ExactPlanner
-from moonteam.planners.unfolding.ahead import imagined, played_out
-from moonteam.planners.unfolding.deciders import Replanning
+from moonteam.planners.unfolding.deciding.deciders import Replanning
+from moonteam.planners.unfolding.deciding.imagined import imagined
+from moonteam.planners.unfolding.deciding.make import Choosing
+from moonteam.planners.unfolding.deciding.pointing import Pointing
+from moonteam.planners.unfolding.deciding.rollouts import rolled_out
 from moonteam.planners.unfolding.future import Future
-from moonteam.planners.unfolding.make import Choosing
-from moonteam.planners.unfolding.pointing import Pointing
 from moonteam.planners.unfolding.world import World
 from moonteam.policies.policy import Policy
 
@@ -32,8 +33,8 @@ def test_a_policy_takes_as_long_in_both_worlds(number):
     while not world.over:
         world.step(orders.act(world.view()))
     problem = imagined(view, [Future(rest, (None,) * len(mission.agents), None)], SIZE)
-    who = np.where(first >= 0, first, SIZE)[None].astype(np.int32)
-    seconds, _, _ = played_out(macro.spec_of(POLICY), POLICY.params, problem,
-                               np.full_like(who, -1), who, np.float32(0))
+    who = np.where(first >= 0, first, SIZE)[None]
+    seconds, _, _ = rolled_out(macro.spec_of(POLICY), POLICY.params, problem, np.zeros(1, int),
+                               who, np.full(who.shape, -1, np.int32), np.float32(0))
     # Times of the macro world are float32, and it sees a hair further.
     assert float(seconds[0]) == pytest.approx(world.outcome.seconds, abs=0.05)

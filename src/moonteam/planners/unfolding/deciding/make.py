@@ -12,11 +12,17 @@ from moonteam.planners.seconds.base import TimedPlanner
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.seconds.keeper import HOME
 from moonteam.planners.seconds.policy import PolicyPlanner
-from moonteam.planners.unfolding.ahead import LookingAhead
-from moonteam.planners.unfolding.consensus import Consensus
-from moonteam.planners.unfolding.deciders import Choose, Decider, Goal, OverFutures, Replanning
-from moonteam.planners.unfolding.pointing import Pointing
-from moonteam.planners.unfolding.search import Middle, NearestUnseen, Pattern, Sweep
+from moonteam.planners.unfolding.deciding.ahead import LookingAhead
+from moonteam.planners.unfolding.deciding.consensus import Consensus
+from moonteam.planners.unfolding.deciding.deciders import (
+    Choose,
+    Decider,
+    Goal,
+    OverFutures,
+    Replanning,
+)
+from moonteam.planners.unfolding.deciding.pointing import Pointing
+from moonteam.planners.unfolding.deciding.search import Middle, NearestUnseen, Pattern, Sweep
 from moonteam.planners.unfolding.state import Order
 from moonteam.planners.unfolding.world import View
 

@@ -1,0 +1,1 @@
+"""Who decides in a mission that unfolds: plans made anew, policies, and both over futures."""
