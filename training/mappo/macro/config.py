@@ -225,10 +225,13 @@ PRESETS = {
         spec=PointerSpec(unfolds=True, worths=True, posts=True), lr=5e-4),
     "searching": MacroConfig(
         "searching", (
+            # What is found is luck, which branches of one mission share no longer than a while: the
+            # critic learns from every decision instead.
             Practice("5 hidden targets", Draw(
                 targets=(5, 5), metric="straight", speeds=(1.5, 0.36, 0.47), looks=4,
-                limit=600.0), shrink=2),
+                limit=600.0), advantages="critic"),
         ),
-        rounds=300, hyper=HYPER, vine=Vine(tau=0.5), spec=PointerSpec(unfolds=True), lr=5e-4),
+        rounds=120, hyper=replace(HYPER, loose=1.0), spec=PointerSpec(layers=5, unfolds=True),
+        lr=3e-4, ent_coef=0.002),
 }
 """By the word behind `moonteam train`."""
