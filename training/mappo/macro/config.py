@@ -225,13 +225,12 @@ PRESETS = {
         spec=PointerSpec(unfolds=True, worths=True, posts=True), lr=5e-4),
     "searching": MacroConfig(
         "searching", (
-            # What is found is luck, which branches of one mission share no longer than a while: the
-            # critic learns from every decision instead.
             Practice("5 hidden targets", Draw(
                 targets=(5, 5), metric="straight", speeds=(1.5, 0.36, 0.47), looks=4,
-                limit=600.0), advantages="critic"),
+                limit=600.0), shrink=2),
         ),
-        rounds=120, hyper=replace(HYPER, loose=1.0), spec=PointerSpec(layers=5, unfolds=True),
-        lr=3e-4, ent_coef=0.002),
+        # What is found is luck, more of it than of what comes elsewhere.
+        rounds=360, hyper=HYPER, vine=Vine(tau=2.0), spec=PointerSpec(layers=5, unfolds=True),
+        lr=3e-4),
 }
 """By the word behind `moonteam train`."""
