@@ -231,6 +231,6 @@ PRESETS = {
         ),
         # What is found is luck, more of it than of what comes elsewhere.
         rounds=360, hyper=HYPER, vine=Vine(tau=2.0), spec=PointerSpec(layers=5, unfolds=True),
-        lr=3e-4),
+        lr=3e-4, eval_scenarios=2048),
 }
 """By the word behind `moonteam train`."""

@@ -177,14 +177,13 @@ class LookingAhead:
 
         So many as `count`, but one where nothing is drawn.
         """
-        alike: dict[tuple, list[int]] = {}
+        alike: dict[tuple[int, ...], list[int]] = {}
         for b in left:
             coming = asked[b].view.coming
             size = max(FEWEST, macro.padded(len(asked[b].open_) + coming))
             team = asked[b].view.moment.has.shape
             some = count if coming or may_lose(asked[b].view) else 1
-            hidden = bool(coming and asked[b].view.looks)
-            alike.setdefault((size, some, *team, hidden), []).append(b)
+            alike.setdefault((size, some, *team), []).append(b)
         found = {}
         for (size, some, *_), missions in alike.items():
             problems, rows, firsts, bounds = [], [], [], []

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from moonteam.grid.macro.draw import places
-from moonteam.grid.macro.sight import INSIDE, Sight
 from moonteam.grid.macro.types import FAR, MacroProblem
 from moonteam.planners import macro
 from moonteam.planners.seconds.base import MS, needs_of
@@ -92,35 +91,4 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
         columns[name] = np.broadcast_to(value, (count, *value.shape))
     columns["coming"] = np.zeros(count, np.int32)
     columns["unseen"] = np.zeros((count, size), np.float32)
-    hidden = (np.arange(size) >= len(open_)) & there
-    return MacroProblem(**columns, sight=_sight(view, spots, hidden, open_))
-
-
-def _sight(view: View, spots: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> Sight | None:
-    """[F] what robots see in futures with everything at `spots` [F, T, 2], some of it `hidden` [T];
-    None where nothing is.
-    """
-    if view.ground is None or not view.coming or not view.looks:
-        return None
-    count, size = spots.shape[:2]
-    reach = [agent.sensor or 0.0 for agent in view.agents]
-    rows, across = view.ground.cuts(INSIDE * min(r for r in reach if r))
-    most = len(rows) * len(across), max(map(len, rows)) * max(map(len, across))
-    points = np.zeros((*most, 2), np.float32)
-    seen, part = np.ones(most, bool), np.zeros((most[0], size), bool)
-    full = np.zeros(most[0], np.int32)
-    for k, look in enumerate(view.looks):
-        points[k, :len(look.unseen)], seen[k, :len(look.unseen)] = look.unseen, False
-        full[k] = round(len(look.unseen) / look.share)
-    look = np.arange(len(view.looks))
-    part[look, np.searchsorted(open_, len(view.targets) + look)] = True
-    here = view.places.astype(np.float32)
-    speed = [agent.speed for agent in view.agents]
-    columns: dict[str, Any] = {
-        "hidden": hidden, "speed": np.array(speed, np.float32),
-        "reach": np.where(view.moment.present, reach, 0.0).astype(np.float32),
-        "points": points, "part": part, "size": full, "seen": seen,
-        "found": np.zeros(size, bool), "here": here, "aim": here}
-    columns = {name: np.broadcast_to(x, (count, *x.shape)) for name, x in columns.items()}
-    columns["at"] = spots.astype(np.float32)
-    return Sight(**columns)
+    return MacroProblem(**columns)
