@@ -147,6 +147,8 @@ class Sessions:
         columns = [names.index(skill) for skill in skills]
         whole: dict[str, Any] = {}
         for field in fields(MacroProblem):
+            if getattr(problem, field.name) is None:  # of hidden targets a moment says nothing
+                continue
             value, room = np.asarray(getattr(problem, field.name)), getattr(blank, field.name)
             whole[field.name] = room = np.array(room)
             if field.name in ("has", "need"):
