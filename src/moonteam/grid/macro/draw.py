@@ -126,9 +126,10 @@ class Draw:
     posts: bool = False
     """Whether there are places to wait at (`post_places`)."""
     looks: int = 0
-    """Where every target is hidden: places from which robots look, so many along either side."""
+    """Where every target is hidden: places from which robots look, so many along either side of the
+    map, whose `sides` are then of one size, its ways straight."""
     sensor: float = 6.0
-    """Cells that every robot sees there."""
+    """Cells that every robot sees around it."""
 
     @property
     def unfolds(self) -> bool:
