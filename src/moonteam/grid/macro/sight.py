@@ -147,12 +147,8 @@ def aimed(sight: Sight, choice: Array) -> Array:
 
 def ways(sight: Sight) -> tuple[Array, Array]:
     """[N, M] s from where everybody is to each target, and [N, M, M] s between these."""
-    def apart(a: Array) -> Array:
-        off = a[:, None] - sight.at[None]
-        return jnp.hypot(off[..., 0], off[..., 1])
-
-    return (apart(sight.here) / sight.speed[:, None],
-            apart(sight.at)[None] / sight.speed[:, None, None])
+    return (_apart(sight.here, sight.at) / sight.speed[:, None],
+            _apart(sight.at, sight.at)[None] / sight.speed[:, None, None])
 
 
 def middles(sight: Sight) -> tuple[Array, Array]:
@@ -161,8 +157,13 @@ def middles(sight: Sight) -> tuple[Array, Array]:
     """
     spread = jnp.mean(sight.points, axis=1)
 
-    def mean(a: Array) -> Array:
-        off = a[:, None] - spread[None]
-        return jnp.mean(jnp.hypot(off[..., 0], off[..., 1]), axis=1) / jnp.max(sight.speed)
+    def mean(places: Array) -> Array:
+        return jnp.mean(_apart(places, spread), axis=1) / jnp.max(sight.speed)
 
     return mean(sight.at), mean(sight.here)
+
+
+def _apart(a: Array, b: Array) -> Array:
+    """[A, B] m from places a [A, 2] to b [B, 2]."""
+    off = a[:, None] - b[None]
+    return jnp.hypot(off[..., 0], off[..., 1])

@@ -404,11 +404,11 @@ def _advance(state: MacroState) -> tuple[MacroState, Array, Array]:
     if problem.sight is not None:
         seen = sight.gone_on(problem.sight, state.busy, moving, wait)
         found, looked = jnp.any(seen.found & ~problem.sight.found), seen.looked
-        problem, lapses = replace(problem, sight=seen), lapses | looked
+        problem = replace(problem, sight=seen)
     vain = bound & (busy <= 0) & (lapsed[here] | stands | looked[here])  # waits for nothing there
     after = replace(
         state, problem=problem, now=now, busy=busy, serving=state.serving & ~ended,
-        solved=state.solved | ended | lapses, lapsed=lapsed,
+        solved=state.solved | ended | lapses | looked, lapsed=lapsed,
         goal=jnp.where(finished | vain, targets, state.goal),
         since=jnp.where(finished | released | vain, now, state.since))
     # Whatever is found may concern everybody.

@@ -6,7 +6,7 @@ end, thousands of them in one call of the macro world. That is one step of polic
 moment itself. What is tried there is the plan of what is known, and what the policy draws; where
 nothing more may come to pass, the plan is all that is needed.
 
-Legend: B missions, K tries of a mission, F futures, R rollouts of a call, N robots, T targets, the
+Legend: B missions, K tries of a mission, F futures, N robots, T targets, the
 open and then the coming ones, padded.
 """
 
