@@ -8,6 +8,7 @@ import pytest
 from moonteam import loading, paths
 from moonteam.cli import main
 from moonteam.commands import testsets_unfolding
+from moonteam.errors import InputError
 from moonteam.evaluation import timed, unfolding
 from moonteam.evaluation.contenders import Options
 from moonteam.planners.unfolding import draw
@@ -75,6 +76,13 @@ def test_rows_over_futures_are_those_asked_for():
         exact, f"{exact} over 8 futures", policy]
     assert names([2, 8], [], (), ahead=True, foresee=["planners", "policies"]) == [
         exact, f"{exact} over 2 futures", policy, f"{policy} over 8 futures"]
+    # Over none it is a policy that plans once all is known.
+    assert names([0, 8], [], ["makespan", "waiting"], ahead=True) == [
+        exact, f"{exact} over 8 futures", f"{exact} over 8 futures, waiting", policy,
+        f"{policy}, then planned", f"{policy} over 8 futures", f"{policy} over 8 futures, waiting"]
+    for hidden in (["places"], ["nearest"]):
+        with pytest.raises(InputError, match="--futures: 0 is for policies"):
+            names([0], hidden, (), ahead=True)
     # Over futures by places alone, where these are asked for; plans agree on what ends soonest.
     assert names([8], ["sweep", "places"], (), ahead=True) == [
         f"{exact}, sweep", f"{exact}, places", f"{exact} over 8 futures, places",
@@ -128,6 +136,7 @@ def test_a_third_of_the_missions_lose_one_robot():
 
 @pytest.mark.parametrize(("words", "says"), [
     (["3x5"], "3x5: is in steps"), (["--futures", "1"], "--futures: 1 is not allowed; 2 to 4096"),
+    (["--futures", "0"], "--futures: 0 is for policies by argmax that can look ahead"),
     (["--goal", "waiting"], "--goal: has no effect without --futures"),
     (["--foresee", "policies"], "--foresee: has no effect without --futures"),
     (["--futures", "4", "--foresee", "all", "--foresee", "policies"],

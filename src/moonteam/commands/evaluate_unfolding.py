@@ -64,8 +64,9 @@ class Args(Seeded, Limited, Resumable, Reported):
     futures: Many[tuple[int, ...]] = ()
     """Also over so many sampled futures; again for more rows. Policies, by argmax alone, go on by
     themselves in the futures; where ways take what is expected, thousands of them in one call, and
-    what they try is then the plan of what is known beside their own choices. Where targets are
-    hidden, by places, what most futures ask for is done."""
+    what they try is then the plan of what is known beside their own choices, and once all is known
+    they plan, which is all that 0 adds to a policy alone. Where targets are hidden, by places,
+    what most futures ask for is done."""
     foresee: Many[tuple[Literal["all", "policies", "planners"], ...]] = ()
     """Rows that are repeated over futures: all (default), those of policies, or those of other
     planners. Again, as often as --futures: for each of these numbers in turn."""

@@ -87,7 +87,8 @@ class Row:
     @property
     def name(self) -> str:
         """Such as exact(makespan) over 16 futures, nearest; or ... over 16 futures, waiting."""
-        over = f" over {self.futures} futures" if self.futures else ""
+        over = f" over {self.futures} futures" if self.futures else (
+            ", then planned" if self.ahead else "")
         aims = f", {self.goal}" if self.futures and self.goal != GOALS[0] else ""
         return f"{self.contender.name}{over}{aims}" + (f", {self.pattern}" if self.pattern else "")
 
@@ -174,11 +175,12 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
     targets are hidden and places to look from are asked for, rows are repeated over futures by
     them alone; what is agreed on there (`consensus`) is for the makespan.
     `foresee` says whose rows are repeated over each number of futures: all, those of policies, or
-    of other planners; one word holds for every number.
+    of other planners; one word holds for every number. Over none only policies are repeated that
+    can look ahead: alone until all is known, then with a plan.
 
     Raises InputError for a number of futures that is none, and words that are more or fewer.
     """
-    for count in futures:
+    for count in filter(None, futures):
         check_futures(count)
     if len(foresee) not in (0, 1, len(futures)):
         raise InputError("--foresee", f"given {len(foresee)} times; once, or as often as --futures")
@@ -198,7 +200,11 @@ def rows_of(contenders: Sequence[by_clock.Contender], futures: Sequence[int],
             elif PLACES in patterns:
                 # By a pattern every mission is imagined by itself, which takes much longer.
                 aims = []
-            found += [Row(one, count, pattern, goal, looks) for count in over for goal in aims]
+            found += [Row(one, count, pattern, goal, looks) for count in over for goal in aims
+                      if count or (looks and goal == GOALS[0])]
+    if 0 in futures and not any(row.ahead and not row.futures for row in found):
+        raise InputError("--futures", "0 is for policies by argmax that can look ahead, where "
+                         "nothing is hidden and ways take what is expected")
     return found
 
 

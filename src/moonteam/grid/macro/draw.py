@@ -15,6 +15,7 @@ from jax import Array
 from moonteam import trees
 from moonteam.grid.config import EnvConfig
 from moonteam.grid.macro.sight import Sight, parts
+from moonteam.grid.macro.streets import Streets
 from moonteam.grid.macro.types import FAR, MacroProblem, plain
 from moonteam.grid.sampling import sample
 from moonteam.grid.types import Problem
@@ -234,6 +235,10 @@ def unfolding(family: Draw, made: MacroProblem, problem: Problem, cells: Array, 
     metric: Metric = "manhattan" if family.metric == "manhattan" else "straight"
     fastest = jnp.max(jnp.where(made.agent_mask, speed, 0.0))
     spots = places(jnp.zeros(2), problem.size - 1.0)
+    if metric == "manhattan":
+        made = replace(made, streets=Streets(
+            at=problem.target_cells.astype(jnp.float32), here=cells.astype(jnp.float32),
+            speed=jnp.where(made.agent_mask, speed, fastest), spread=spots))
     mean = lambda at: jnp.mean(apart(at, spots, metric), axis=1) / fastest
     return replace(made, middle=mean(problem.target_cells), middle_now=mean(cells))
 

@@ -14,6 +14,7 @@ import jax
 from jax import Array
 
 from moonteam.grid.macro.sight import Sight
+from moonteam.grid.macro.streets import Streets
 
 FAR = 1.0e9
 """s that stand for "no way" and "no limit"."""
@@ -53,6 +54,8 @@ class MacroProblem:
     agent_mask: Array  # [N] bool
     target_mask: Array  # [M] bool
     unit: Array  # [] s by which times are divided where numbers of order one are wanted
+    streets: Streets | None = None
+    """Where ways are along x and then y, and nothing bars them: places, for those who turn."""
     sight: Sight | None = None
     """Where targets are hidden: places, what robots see and have seen; then ways are straight."""
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from moonteam import trees
-from moonteam.grid.macro import sight
+from moonteam.grid.macro import sight, streets
 from moonteam.grid.macro.types import FAR, MacroProblem, MacroResult, MacroState
 
 NEAR = 0.5
@@ -247,16 +247,22 @@ def loosen(state: MacroState, who: Array) -> MacroState:
     due = jnp.any(problem.after & bound[:, None], axis=0)
     who = who & ~state.serving[here] & ~due[here]
     rest = jnp.minimum(state.busy, state.leg)
-    start = along(legs(problem, state.origin), legs(problem, state.node),
-                  (state.leg - rest)[:, None], rest[:, None])
+    gone = state.leg - rest
+    if problem.streets is None:
+        start = along(legs(problem, state.origin), legs(problem, state.node), gone[:, None],
+                      rest[:, None])
+        middle = (rest * middle_of(state, state.origin) + gone * middle_of(state, state.node)
+                  ) / jnp.maximum(gone + rest, SOON)
+    else:
+        turned = streets.turned(problem.streets, who, state.origin, state.node, gone)
+        start = jnp.where(problem.start < FAR, streets.ways(turned), FAR)
+        middle = streets.middle_now(turned)
+        problem = replace(problem, streets=turned)
     own = jax.nn.one_hot(state.goal, targets, dtype=bool)
     start = jnp.where(own, rest[:, None], start)
     near, far = _way_home(problem, state.origin), _way_home(problem, state.node)
     # Of those that need not go home both are 0, where nobody has anywhere to go.
-    home = jnp.where((near <= 0) & (far <= 0), 0.0, along(near, far, state.leg - rest, rest))
-    gone = state.leg - rest
-    middle = (rest * middle_of(state, state.origin) + gone * middle_of(state, state.node)
-              ) / jnp.maximum(gone + rest, SOON)
+    home = jnp.where((near <= 0) & (far <= 0), 0.0, along(near, far, gone, rest))
     out = replace(problem, start=jnp.where(who[:, None], start, problem.start),
                   home_now=jnp.where(who, home, problem.home_now),
                   middle_now=jnp.where(who, middle, problem.middle_now))
@@ -285,8 +291,8 @@ def _placed(state: MacroState) -> MacroState:
 def along(near: Array, far: Array, gone: Array, rest: Array) -> Array:
     """s to c from the point of the way from a to b that is `gone` s from a and `rest` s from b.
 
-    Stewart's theorem, of `near` s from a to c and `far` s from b to c: exact on straight ways, on
-    others kept within what the triangle allows.
+    Stewart's theorem, of `near` s from a to c and `far` s from b to c: exact on straight ways. On
+    others it is kept within what the triangle allows, and may be off by as much (see `streets`).
     """
     square = (rest * near**2 + gone * far**2) / jnp.maximum(gone + rest, SOON) - gone * rest
     low = jnp.maximum(jnp.abs(near - gone), jnp.abs(far - rest))

@@ -110,6 +110,11 @@ def test_where_nothing_more_may_come_the_plan_of_what_is_known_is_done():
     exact = ExactPlanner().plan(view.moment)
     assert plan.tolist() == choices(view.moment, order_of(exact)).tolist()
     assert of_the_known(replace(view.moment, limit=1)) is None
+    # Over no future nothing else is changed of the policy alone.
+    first = World(problem).view()
+    alone, planned = LookingAhead(POLICY, 0).choose([first, view])
+    assert alone.tolist() == Pointing(POLICY).choose([first])[0].tolist()
+    assert planned.tolist() == plan.tolist()
 
 
 @pytest.mark.parametrize(("goal", "place"), [("makespan", 0), ("waiting", 1)])

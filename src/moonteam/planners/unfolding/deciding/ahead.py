@@ -1,10 +1,11 @@
 """A policy that looks ahead: it plays what a plan says, and what else it could do, in many futures.
 
 Where targets follow on others or arrive by a clock, or a robot may be lost, what is to come can be
-drawn, and the policy can go on in each of these futures by its likeliest choices to the
-end, thousands of them in one call of the macro world. That is one step of policy iteration, at the
-moment itself. What is tried there is the plan of what is known, and what the policy draws; where
-nothing more may come to pass, the plan is all that is needed.
+drawn, and the policy can go on in each of these futures by its likeliest choices,
+thousands of them in one call of the macro world: until nothing more may come to pass, for from
+there on the plan is all that is needed, in a future as in the mission. That is one step of policy
+iteration, at the moment itself. What is tried there is the plan of what is known, and what the
+policy draws.
 
 Legend: B missions, K tries of a mission, F futures, N robots, T targets, the
 open and then the coming ones, padded.
@@ -32,7 +33,7 @@ from moonteam.planners.seconds.local import LocalSearchPlanner
 from moonteam.planners.seconds.search.labels import MAX_AGENTS
 from moonteam.planners.unfolding.deciding.deciders import Goal, by_time
 from moonteam.planners.unfolding.deciding.imagined import imagined
-from moonteam.planners.unfolding.deciding.pointing import begun, moments, said
+from moonteam.planners.unfolding.deciding.pointing import Pointing, begun, moments, said
 from moonteam.planners.unfolding.deciding.rollouts import rolled_out
 from moonteam.planners.unfolding.deciding.search import posts, without_posts
 from moonteam.planners.unfolding.future import future, may_lose
@@ -80,7 +81,8 @@ class LookingAhead:
 
     Args:
       policy: of kind pointer.
-      futures: F, the most that are drawn at a moment; one where nothing is to come.
+      futures: F, the most that are drawn at a moment; one where nothing is to come. 0: it does not
+        look ahead, and until a plan is all that is needed does what the policy finds likeliest.
       goal: what counts in a future: its makespan, or how long targets wait for their services.
       seed: of the draws.
       preference: 0 time .. 1 effort, of the policy.
@@ -93,6 +95,7 @@ class LookingAhead:
         self._spec, self._params = macro.spec_of(policy), policy.params
         self._futures, self._goal, self._seed = futures, goal, seed
         self._preference = np.float32(preference)
+        self._pointing = Pointing(policy, preference)
 
     def choose(self, views: Sequence[View]) -> list[np.ndarray]:
         """[B] of [N] int64: a target's number, WAIT, or of a plan HOME."""
@@ -102,7 +105,10 @@ class LookingAhead:
         best = {key: plan for key, plan in plans.items()
                 if plan is not None and sure(once[key]) and self._goal == "makespan"}
         rest = {key: view for key, view in once.items() if key not in best}
-        if rest:
+        if rest and not self._futures:
+            pointed = zip(views, self._pointing.choose(views), strict=True)
+            best = {id(view): choice for view, choice in pointed} | best
+        elif rest:
             asked = self._ask(list(rest.values()), len(views), [plans[key] for key in rest])
             best |= dict(zip(rest, self._best(asked), strict=True))
         return [best[id(view)] for view in views]
@@ -199,7 +205,7 @@ class LookingAhead:
             whole: MacroProblem = jax.tree.map(lambda *x: np.concatenate(x), *problems)
             row, first, bound = (np.concatenate(x) for x in (rows, firsts, bounds))
             done = rolled_out(self._spec, self._params, whole, row, first, bound,
-                              self._preference)
+                              self._preference, self._goal == "makespan")
             ends = np.cumsum([len(row) for row in rows])[:-1]
             for b, *own in zip(missions, *(np.split(x, ends) for x in done), strict=True):
                 found[b] = self._cost(asked[b], *own).reshape(-1, some)

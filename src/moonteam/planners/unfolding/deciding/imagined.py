@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from moonteam.grid.macro.draw import places
+from moonteam.grid.macro.streets import Streets
 from moonteam.grid.macro.types import FAR, MacroProblem
 from moonteam.planners import macro
 from moonteam.planners.seconds.base import MS, needs_of
@@ -64,7 +65,7 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
     waits = np.zeros((count, size, size), bool)
     waits[:, :len(open_), :len(open_)] = known.after[np.ix_(open_, open_)]
     area = None if state.problem.expects is None else state.problem.expects.area
-    middle = np.zeros((count, size))
+    middle, spread = np.zeros((count, size)), np.zeros((0, 2))
     if coming and area is not None:
         spread = places(np.array(area[:2]), np.array(area[2:]))
         middle = distances(spots, spread, metric).mean(-1) / speed.max() * there
@@ -91,4 +92,10 @@ def imagined(view: View, futures: Sequence[Future], size: int) -> MacroProblem:
         columns[name] = np.broadcast_to(value, (count, *value.shape))
     columns["coming"] = np.zeros(count, np.int32)
     columns["unseen"] = np.zeros((count, size), np.float32)
+    if metric == "manhattan":
+        same = {"here": view.places, "speed": speed, "spread": spread}
+        drawn: dict[str, Any] = {name: np.broadcast_to(x, (count, *x.shape)).astype(np.float32)
+                                 for name, x in same.items()}
+        drawn["at"] = spots.astype(np.float32)
+        columns["streets"] = Streets(**drawn)
     return MacroProblem(**columns)
