@@ -14,6 +14,7 @@ from jax import Array
 
 from moonteam import trees
 from moonteam.grid.config import EnvConfig
+from moonteam.grid.macro.apart import apart
 from moonteam.grid.macro.sight import Sight, parts
 from moonteam.grid.macro.streets import Streets
 from moonteam.grid.macro.types import FAR, MacroProblem, plain
@@ -27,14 +28,6 @@ def bits(mask: Array, skills: int = MAX_SKILLS) -> Array:
     """[...] bit mask -> [..., S] bool."""
     shifts = jnp.arange(skills, dtype=mask.dtype).reshape(*[1] * mask.ndim, skills)
     return ((mask[..., None] >> shifts) & 1) == 1
-
-
-def apart(a: Array, b: Array, metric: Metric) -> Array:
-    """[..., A, B] metres from places a [..., A, 2] to b [..., B, 2]."""
-    shift = jnp.abs(a[..., :, None, :] - b[..., None, :, :]).astype(jnp.float32)
-    if metric == "manhattan":
-        return jnp.sum(shift, axis=-1)
-    return jnp.sqrt(jnp.sum(shift**2, axis=-1))
 
 
 def unit_of(start: Array, has: Array, need: Array, agent_mask: Array, target_mask: Array) -> Array:

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from moonteam.grid.macro.apart import apart
+
 INSIDE = 0.98
 """Share of a sensor's reach from which a point is looked at."""
 HAIR = 1e-3
@@ -147,8 +149,8 @@ def aimed(sight: Sight, choice: Array) -> Array:
 
 def ways(sight: Sight) -> tuple[Array, Array]:
     """[N, M] s from where everybody is to each target, and [N, M, M] s between these."""
-    return (_apart(sight.here, sight.at) / sight.speed[:, None],
-            _apart(sight.at, sight.at)[None] / sight.speed[:, None, None])
+    return (apart(sight.here, sight.at, "straight") / sight.speed[:, None],
+            apart(sight.at, sight.at, "straight")[None] / sight.speed[:, None, None])
 
 
 def middles(sight: Sight) -> tuple[Array, Array]:
@@ -158,12 +160,6 @@ def middles(sight: Sight) -> tuple[Array, Array]:
     spread = jnp.mean(sight.points, axis=1)
 
     def mean(places: Array) -> Array:
-        return jnp.mean(_apart(places, spread), axis=1) / jnp.max(sight.speed)
+        return jnp.mean(apart(places, spread, "straight"), axis=1) / jnp.max(sight.speed)
 
     return mean(sight.at), mean(sight.here)
-
-
-def _apart(a: Array, b: Array) -> Array:
-    """[A, B] m from places a [A, 2] to b [B, 2]."""
-    off = a[:, None] - b[None]
-    return jnp.hypot(off[..., 0], off[..., 1])

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from moonteam.grid.macro.apart import apart
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -41,16 +43,12 @@ def turned(streets: Streets, who: Array, origin: Array, node: Array, gone: Array
 
 def ways(streets: Streets) -> Array:
     """[N, M] s from where everybody starts to each target."""
-    return _apart(streets.here, streets.at) / streets.speed[:, None]
+    return apart(streets.here, streets.at, "manhattan") / streets.speed[:, None]
 
 
 def middle_now(streets: Streets) -> Array:
     """[N] s from where everybody starts to where targets may come, in the mean, by the fastest."""
     if not len(streets.spread):
         return jnp.zeros(len(streets.here))
-    return jnp.mean(_apart(streets.here, streets.spread), axis=1) / jnp.max(streets.speed)
-
-
-def _apart(a: Array, b: Array) -> Array:
-    """[A, B] cells from a [A, 2] to b [B, 2]."""
-    return jnp.sum(jnp.abs(a[:, None] - b[None]), axis=-1)
+    far = apart(streets.here, streets.spread, "manhattan")
+    return jnp.mean(far, axis=1) / jnp.max(streets.speed)

@@ -10,12 +10,11 @@ from moonteam.planners import macro
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.unfolding.deciding.deciders import Replanning
 from moonteam.planners.unfolding.deciding.imagined import imagined
-from moonteam.planners.unfolding.deciding.make import Choosing
-from moonteam.planners.unfolding.deciding.pointing import Pointing
 from moonteam.planners.unfolding.deciding.rollouts import FEW, rolled_out
 from moonteam.planners.unfolding.future import Future, future
 from moonteam.planners.unfolding.world import World
 from moonteam.policies.policy import Policy
+from tests.planners.unfolding.deciding.both_worlds import took
 
 POLICY = Policy.load(paths.find("unfolding_further", "policies", ".safetensors"))
 SIZE = 12
@@ -31,7 +30,7 @@ def futures(mission, count):
 
 
 def test_what_comes_of_a_rollout_does_not_depend_on_how_many_share_the_pool():
-    mission = loading.load_set(paths.find("unfolding/following", "testsets", ".jsonl"))[3]
+    mission = loading.load_set(paths.find("unfolding/following", "testsets", ".jsonl"))[7]
     problems, firsts = futures(mission, 4)
     open_ = len(firsts)
 
@@ -45,7 +44,7 @@ def test_what_comes_of_a_rollout_does_not_depend_on_how_many_share_the_pool():
     assert len(few) <= FEW
     alone = rolled(few)
     assert len(np.unique(alone[0].round(3))) > open_  # they do differ
-    assert np.median(alone[0]) < mission.max_seconds
+    assert (alone[0] < mission.max_seconds).all()
     many = np.random.default_rng(0).permutation(np.tile(few, 8))  # more than have a place at once
     assert len(many) > 2 * FEW
     for a, b in zip(alone, rolled(many), strict=True):
@@ -62,23 +61,19 @@ def test_a_plan_of_what_is_left_is_never_later_than_the_policy(service):
     row = np.repeat(np.arange(8), len(firsts))
     first = np.tile(firsts, (8, 1))
 
-    def spans(some):
+    def spans(some, finish):
         return rolled_out(macro.spec_of(POLICY), POLICY.params, some, row, first,
                           np.full(first.shape, -1, np.int32), np.float32(0), finish)[0]
 
-    finish = False
-    alone = spans(problems)
-    finish = True
-    planned = spans(problems)
+    alone, planned = spans(problems, False), spans(problems, True)
     assert (planned <= alone + 2e-2).all()
     assert (planned < alone - 0.5).any()
     late = replace(problems, limit=np.sort(planned)[:8].astype(np.float32) - 1)
-    assert (spans(late) > late.limit[row]).any(), "what is not done in time counts as not done"
+    over = spans(late, True) > late.limit[row]
+    assert over.any(), "what is not done in time counts as not done"
     # Where robots have homes, nobody plans, and nothing is else than without.
     homely = replace(problems, home=problems.home + np.float32(1) * targets[:, None])
-    both = spans(homely)
-    finish = False
-    np.testing.assert_array_equal(both, spans(homely))
+    np.testing.assert_array_equal(spans(homely, True), spans(homely, False))
 
 
 @pytest.mark.parametrize("number", [1, 2, 5, 9])
@@ -89,12 +84,5 @@ def test_a_policy_takes_as_long_in_both_worlds(number):
     rest = mission.targets[len(view.targets):]
     assert rest
     problem = imagined(view, [Future(rest, (None,) * len(view.agents), None)], SIZE)
-    pointing = Pointing(POLICY)
-    first = pointing.choose([view])[0]
-    orders = Choosing(pointing.choose, Replanning(ExactPlanner()))
-    while not world.over:
-        world.step(orders.act(world.view()))
-    who = np.where(first >= 0, first, SIZE)[None]
-    span, _, _ = rolled_out(macro.spec_of(POLICY), POLICY.params, problem, np.zeros(1, int), who,
-                            np.full(who.shape, -1, np.int32), np.float32(0))
-    assert float(span[0]) == pytest.approx(world.outcome.seconds, abs=0.05)
+    here, there = took(POLICY, world, view, problem, Replanning(ExactPlanner()))
+    assert there == pytest.approx(here, abs=0.05)

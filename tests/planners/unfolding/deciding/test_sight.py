@@ -9,16 +9,14 @@ import pytest
 from moonteam import loading, paths
 from moonteam.grid.macro import world as macro_world
 from moonteam.grid.macro.sight import INSIDE, Sight
-from moonteam.planners import macro
 from moonteam.planners.seconds.exact import ExactPlanner
 from moonteam.planners.unfolding.deciding.deciders import Replanning
 from moonteam.planners.unfolding.deciding.imagined import imagined
-from moonteam.planners.unfolding.deciding.make import Choosing
-from moonteam.planners.unfolding.deciding.pointing import Pointing, problem_in
-from moonteam.planners.unfolding.deciding.rollouts import rolled_out
+from moonteam.planners.unfolding.deciding.pointing import problem_in
 from moonteam.planners.unfolding.future import Future
 from moonteam.planners.unfolding.world import World
 from moonteam.policies.policy import Policy
+from tests.planners.unfolding.deciding.both_worlds import took
 
 POLICY = Policy.load(paths.find("any_team", "policies", ".safetensors"))
 SIZE = 24
@@ -79,14 +77,6 @@ def test_a_policy_sees_the_same_of_places_to_look_from_in_both_worlds():
 
 @pytest.mark.parametrize("number", [0, 4, 8, 11])
 def test_a_policy_takes_as_long_in_both_worlds(number):
-    world, view, problem = beginning(number)
-    pointing = Pointing(POLICY)
-    first = pointing.choose([view])[0]
-    orders = Choosing(pointing.choose, PLACES)
-    while not world.over:
-        world.step(orders.act(world.view()))
-    who = np.where(first >= 0, first, SIZE)[None]
-    seconds, _, _ = rolled_out(macro.spec_of(POLICY), POLICY.params, problem, np.zeros(1, int),
-                               who, np.full(who.shape, -1, np.int32), np.float32(0))
+    here, there = took(POLICY, *beginning(number), PLACES)
     # Times of the macro world are float32, and it sees a hair further.
-    assert float(seconds[0]) == pytest.approx(world.outcome.seconds, abs=0.05)
+    assert there == pytest.approx(here, abs=0.05)

@@ -17,8 +17,10 @@ from moonteam.planners.search.travel import UNREACHABLE
 from moonteam.planners.seconds.search.labels import shortcut
 from moonteam.planners.seconds.search.work import Work
 
-_MOST_SKILLS = 8
-_NO_LIMIT = 1 << 62
+MOST_SKILLS = 8
+"""That the search in steps tells apart."""
+NO_LIMIT = 1 << 62
+"""Nodes of the search that it never comes to."""
 
 
 @njit(cache=True, nogil=True)
@@ -37,7 +39,7 @@ def fits(work: Work, alpha: float, beta: float) -> bool:
     asks = (len(work.before) or work.ready.any() or work.free.any() or work.home.any()
             or work.idle_way.any() or (work.need > 1).any() or work.floor
             or (work.late < work.limit - work.service).any()
-            or work.has.shape[1] > _MOST_SKILLS)
+            or work.has.shape[1] > MOST_SKILLS)
     if asks or (beta > 0.0 and (work.service.any() or (work.effort != work.effort[0]).any())):
         return False
     return not _roundabout(work, beta == 0.0)
@@ -59,7 +61,7 @@ def solve(work: Work, alpha: float,
     outcome, span, moves, _ = schedules.solve(
         _whole(work.start + stay), _whole(work.between + stay), work.classes.astype(np.int32),
         (work.has @ bits).astype(np.int32), ((work.need > 0) @ bits).astype(np.int32),
-        ~work.either, alpha, fine, horizon, 0.0, np.inf, _NO_LIMIT, routes)
+        ~work.either, alpha, fine, horizon, 0.0, np.inf, NO_LIMIT, routes)
     cost = alpha * span + weight * moves
     if outcome != schedules.OPTIMAL or cost >= (alpha + weight) * UNREACHABLE:
         return None

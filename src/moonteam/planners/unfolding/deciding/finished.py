@@ -12,14 +12,12 @@ from moonteam.grid.macro.types import FAR, MacroProblem
 from moonteam.planners.search import schedules
 from moonteam.planners.search.travel import UNREACHABLE
 from moonteam.planners.seconds.base import MS
-
-MOST_SKILLS = 8
-_NO_LIMIT = 1 << 62
+from moonteam.planners.seconds.search.plain import MOST_SKILLS, NO_LIMIT
 
 
 def fits(problems: MacroProblem) -> np.ndarray:
     """[B] bool, whether what is left, once it is known, is travel, services and minimal coalitions
-    alone, which the search in steps solves. Of NumPy arrays.
+    alone, which the search in steps solves (see `seconds.search.plain`). Of NumPy arrays.
     """
     p = problems
     asks = (p.after, p.home, p.home_now, p.need > 1, p.worth, p.lapses < FAR, p.looks,
@@ -78,6 +76,6 @@ def _ends(row, ways, open_, between, service, has, need, both):
                 count += 1
         outcome, span, _, _ = schedules.solve(
             start, apart[:count].copy(), kinds, has[b], need[b][some], both[b][some], 1.0, 0.0,
-            UNREACHABLE - 1, 0.0, np.inf, _NO_LIMIT, np.empty((n, m), np.int32))
+            UNREACHABLE - 1, 0.0, np.inf, NO_LIMIT, np.empty((n, m), np.int32))
         found[r] = span / MS if outcome == schedules.OPTIMAL else np.inf
     return found
