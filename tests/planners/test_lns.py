@@ -154,7 +154,7 @@ def test_inserting_one_event_costs_what_the_place_said():
         before = insertion.measure(ways, teams, line, count - 1)
         last = int(line.order[-1])
         cost, _, place, crew = insertion.best_place(
-            last, ways, teams, line, count - 1, *before, 1.0, 0.01, 10_000, 0.0)
+            last, ways, teams, line, count - 1, *before, 1.0, 0.01, 10_000, 0.0, 0.0)
         insertion.put(line, count - 1, place, last, crew)
         makespan, moves = insertion.measure(ways, teams, line, count)
         assert cost == pytest.approx(makespan + 0.01 * moves)

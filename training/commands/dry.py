@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from moonteam import files
 
 if TYPE_CHECKING:
+    from training.guide.recipe import Guiding
     from training.mappo.macro.config import MacroConfig, Practice
     from training.teacher.imitation import Imitation
     from training.teacher.refinement import Refinement
@@ -103,6 +104,23 @@ def taught(title: str, config: Imitation | Refinement, source: str, lead: str
         *_head(title, document),
         f"decisions: {document['env_steps']:,} env steps and {document['labelled']:,} labelled "
         f"states in {config.rounds:,} rounds", *rows, f"learner: lr {config.lr:g}, {lead}"])
+
+
+def guiding(config: Guiding) -> tuple[dict[str, Any], str]:
+    """Of an evolution of guides: the document and the text."""
+    from moonteam.planners.search.guides import PLAIN
+
+    sizes = [dataclasses.asdict(p) | {"practice": p.name} for p in config.practices]
+    searches = config.population * sum(p.problems for p in config.practices)
+    document = {"method": "separable CMA-ES", "config": dataclasses.asdict(config), "source": "",
+                "parameters": len(PLAIN), "practices": sizes, "env_steps": config.rounds * searches}
+    rows = [f"  {size['practice']}: {size['problems']} problems a generation, weight "
+            f"{size['weight']:g}" for size in sizes]
+    return document, "\n".join([
+        *_head("moonteam train guide", document),
+        f"searches: {document['env_steps']:,} in {config.rounds:,} generations of "
+        f"{config.population} candidates, {searches:,} a generation", *rows,
+        f"looked at: {config.held_out} held-out problems a size, an eighth of the large"])
 
 
 def _document(method: str, config: Any, source: str, families: Sequence[dict[str, Any]],

@@ -18,7 +18,7 @@ from training.mappo import config as configs
 from training.mappo.config import Config
 
 if TYPE_CHECKING:
-    from training.commands import compare, imitate, macro, refine
+    from training.commands import compare, guide, imitate, macro, refine
 
 MACRO = ("quick", "paper_team", "any_team", "any_team_further", "unfolding", "lapsing", "searching",
          "crews")
@@ -29,9 +29,12 @@ REFINE = "refine"
 """MAPPO from an imitated policy; see `training.commands.refine`."""
 COMPARE = "compare"
 """Runs side by side; see `training.commands.compare`."""
-ELSEWHERE = dict.fromkeys(MACRO, "macro") | {name: name for name in (IMITATE, REFINE, COMPARE)}
+GUIDE = "guide"
+"""A guide of local search; see `training.commands.guide`."""
+ELSEWHERE = dict.fromkeys(MACRO, "macro") | {
+    name: name for name in (IMITATE, REFINE, COMPARE, GUIDE)}
 """First words with options of their own, and the modules that read them."""
-NAMES = (*MACRO, f"{IMITATE} quick", f"{IMITATE} any_team", REFINE)
+NAMES = (*MACRO, f"{IMITATE} quick", f"{IMITATE} any_team", REFINE, GUIDE)
 """What else there is to train."""
 
 
@@ -43,6 +46,7 @@ class Args(Together, Watched):
     (quick takes five minutes on two cores; any_team is what ships). The rest is what it is held
     against: pi_5t, pi_6t, pi_7t, pi_5t5r, small and laptop, the paper's network a cell a decision;
     imitate quick|any_team, the exact planner's pupil, and refine, which goes on from one by MAPPO.
+    guide trains what steers local search for large teams.
     They have options of their own: moonteam train quick --help, moonteam train imitate --help.
     compare puts runs side by side: moonteam train compare --help.
 
@@ -71,6 +75,10 @@ class Args(Together, Watched):
     sets aside for them."""
 
 
+if TYPE_CHECKING:
+    Trained = Args | guide.Args | imitate.Args | macro.Args | refine.Args
+
+
 def parse(words: list[str]) -> Any:
     """Arguments of the command; the preset's numbers are the defaults of all options.
 
@@ -88,7 +96,7 @@ def parse(words: list[str]) -> Any:
     return parse_words(Args, f"train {name if named else 'PRESET'}", rest, default)
 
 
-def run(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> int:
+def run(args: Trained | compare.Args) -> int:
     """Trains, describes or compares; returns the exit code."""
     from moonteam.compilation import enable_cache
 
@@ -105,7 +113,7 @@ def run(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> 
     return _train(args)
 
 
-def folder(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) -> Path:
+def folder(args: Trained | compare.Args) -> Path:
     """The run folder of a training. Raises InputError for a command that trains nothing."""
     from training.commands import compare
 
@@ -114,16 +122,17 @@ def folder(args: Args | imitate.Args | macro.Args | refine.Args | compare.Args) 
     return _place(args)
 
 
-def _place(args: Args | imitate.Args | macro.Args | refine.Args) -> Path:
+def _place(args: Trained) -> Path:
     """The run folder."""
-    from training.commands import macro, refine
+    from training.commands import imitate, macro, refine
 
     if isinstance(args, Args):
         return args.folder(args.config.name, args.config.seed)
     if isinstance(args, macro.Args):
         return args.folder(args.config.macro, args.config.seed)
-    name = REFINE if isinstance(args, refine.Args) else f"{IMITATE}-{args.preset}"
-    return args.folder(name, args.seed)
+    if isinstance(args, imitate.Args):
+        return args.folder(f"{IMITATE}-{args.preset}", args.seed)
+    return args.folder(REFINE if isinstance(args, refine.Args) else GUIDE, args.seed)
 
 
 def _train(args: Args) -> int:

@@ -21,6 +21,8 @@ from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective
 from moonteam.planners.exact import MAX_TARGETS
 from moonteam.planners.search import insertion, schedules
+from moonteam.planners.search.guides import PLAIN
+from moonteam.planners.search.neighbourhoods import guide_of, improve
 from moonteam.planners.search.task import weights
 from moonteam.planners.search.teams import coalitions
 from moonteam.planners.search.travel import UNREACHABLE, distance_field
@@ -149,21 +151,17 @@ def _search_near(start, between, kinds, skills, need, both, alpha, beta, horizon
     teams = coalitions(start, skills, need, both)
     line, other = insertion.empty(ways, teams), insertion.empty(ways, teams)
     every = np.arange(m).astype(np.int32)
-    _, makespan, moves = insertion.insert_all(every.copy(), True, ways, teams, line, 0, alpha, beta,
-                                              horizon, 0.0, m)
+    _, makespan, moves, _ = insertion.insert_all(
+        every.copy(), True, ways, teams, line, 0, alpha, beta, horizon, 0.0, 0.0, m)
     cost = insertion.price(makespan, moves, alpha, beta, horizon)
-    _, makespan, moves = insertion.insert_all(every, False, ways, teams, other, 0, alpha, beta,
-                                              horizon, 0.0, m)
+    _, makespan, moves, _ = insertion.insert_all(
+        every, False, ways, teams, other, 0, alpha, beta, horizon, 0.0, 0.0, m)
     if insertion.price(makespan, moves, alpha, beta, horizon) < cost:
         line = other
     best_order, best_crew = line.order.copy(), line.crew.copy()
     order, crew = line.order.copy(), line.crew.copy()
-    warm = max(alpha, beta)
-    for part in range(4):  # cooler and cooler
-        insertion.improve(
-            ways, teams, order, crew, alpha, beta, alpha, beta, horizon, iterations // 4,
-            warm * 2.0 * 0.4**part, warm * 2.0 * 0.4**(part + 1), seed + part, best_order,
-            best_crew)
+    improve(guide_of(PLAIN), ways, teams, order, crew, alpha, beta, alpha, beta, horizon,
+            max(alpha, beta), iterations, np.inf, 0.0, 1.0, seed, best_order, best_crew)
     for a in range(n):
         count = 0
         for i in range(m):

@@ -18,8 +18,9 @@ from moonteam.errors import InputError
 from moonteam.planners.base import IntArray, Objective, Snapshot
 from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.plans.follow import Answer, RoutePlanner
-from moonteam.planners.search import insertion
+from moonteam.planners.search import insertion, neighbourhoods
 from moonteam.planners.search.bounds import lower_bounds
+from moonteam.planners.search.guides import PLAIN, Floats
 from moonteam.planners.search.insertion import Ways
 from moonteam.planners.search.task import Task, value_of, weights
 from moonteam.planners.search.teams import Teams, teams_of
@@ -27,7 +28,6 @@ from moonteam.planners.search.teams import Teams, teams_of
 MAX_AGENTS = 62
 """Coalitions are bit masks of 64 bits."""
 
-_HOT, _COLD = 2.0, 0.3  # temperatures in units of one step (or move)
 _STEER = 0.05  # weight of moves while searching for makespan: it breaks ties on plateaus
 _BLOCK = 250  # iterations between looks at the clock, at most
 _FIRST, _SLICE = 5, 0.02  # the first so many; s that they then may take
@@ -87,7 +87,7 @@ def insert(task: Task, goal: Weights, teams: Teams, regret: bool) -> Events:
     """A list of events made by insertion, with regret or cheapest first."""
     count = len(task.targets)
     return Events(*insertion.inserted(
-        _ways(task), teams, regret, goal.alpha, goal.beta, task.horizon,
+        _ways(task), teams, regret, goal.alpha, goal.beta, task.horizon, 0.0,
         count if count <= _LARGE else insertion.SOME), teams)
 
 
@@ -109,7 +109,7 @@ def best_insertion(task: Task, goal: Weights, hurry: bool = False) -> Events:
 
 
 def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: int | None,
-            until: float | None, threads: int = 1) -> Events:
+            until: float | None, threads: int = 1, guide: Floats = PLAIN) -> Events:
     """The best list found from `events` on.
 
     Args:
@@ -120,41 +120,58 @@ def improve(task: Task, goal: Weights, events: Events, seed: int, iterations: in
       iterations: budget; with it alone the result depends on nothing but seed and threads.
       until: `time.perf_counter()` at which to stop.
       threads: searches side by side, each with the whole budget; the best counts.
+      guide: what is taken out and how it is put back, see `neighbourhoods`.
     """
     stop = Event()
     if threads == 1:
-        return _improved(task, goal, events, seed, iterations, until, stop)
+        return _improved(task, goal, events, seed, iterations, until, guide, stop)
     with ThreadPoolExecutor(threads) as pool:
         try:
             found = list(pool.map(lambda k: _improved(
-                task, goal, events, seed + k * _APART, iterations, until, stop), range(threads)))
+                task, goal, events, seed + k * _APART, iterations, until, guide, stop),
+                range(threads)))
         finally:  # an interruption waits for none of them
             stop.set()
     return min(found, key=lambda one: cost(task, goal, one))
+
+
+def searched(task: Task, goal: Weights, events: Events, seed: int, places: int,
+             guide: Floats) -> Events:
+    """As `improve`, until so many places were tried: that takes as long with any guide."""
+    now, best = events.copy(), events.copy()
+    if len(task.targets) > 1:
+        neighbourhoods.improved(
+            guide, _ways(task), now.teams, now.order, now.crew, goal.alpha, goal.beta,
+            goal.true_alpha, goal.true_beta, task.horizon, goal.unit, places, float(places), 0.0,
+            1.0, seed, best.order, best.crew)
+    return best
 
 
 _APART = 1_000_003  # between the seeds of searches side by side
 
 
 def _improved(task: Task, goal: Weights, events: Events, seed: int, iterations: int | None,
-              until: float | None, stop: Event) -> Events:
+              until: float | None, guide: Floats, stop: Event) -> Events:
     """`improve` in this thread, until somebody sets `stop`."""
     now, best, ways = events.copy(), events.copy(), _ways(task)
     began, done, room = time.perf_counter(), 0, _BLOCK if until is None else _FIRST
-    cooling = math.log(_COLD / _HOT)
+    each = 0.0  # s an iteration
+
+    def share(done: int, clock: float) -> float:
+        """Of the whole search."""
+        by_count = 0.0 if iterations is None else done / iterations
+        by_clock = 0.0 if until is None else (clock - began) / max(until - began, 1e-9)
+        return min(max(by_count, by_clock), 1.0)
+
     while len(task.targets) > 1 and iterations != 0 and not stop.is_set():
         clock = time.perf_counter()
-        shares = [done / iterations] if iterations is not None else []
-        if until is not None:
-            shares.append((clock - began) / max(until - began, 1e-9))
-        share = max(shares)
-        if share >= 1.0:
+        if (before := share(done, clock)) >= 1.0:
             break
         block = room if iterations is None else min(room, iterations - done)
-        hot = goal.unit * _HOT * math.exp(cooling * share)
-        insertion.improved(
-            ways, now.teams, now.order, now.crew, goal.alpha, goal.beta, goal.true_alpha,
-            goal.true_beta, task.horizon, block, hot, hot, seed + done, best.order, best.crew)
+        neighbourhoods.improved(
+            guide, ways, now.teams, now.order, now.crew, goal.alpha, goal.beta, goal.true_alpha,
+            goal.true_beta, task.horizon, goal.unit, block, math.inf, before,
+            share(done + block, clock + block * each), seed + done, best.order, best.crew)
         done += block
         if until is not None:
             clock, each = time.perf_counter(), (time.perf_counter() - began) / done

@@ -1,0 +1,1 @@
+"""Guides of local search, learned by an evolution strategy."""
