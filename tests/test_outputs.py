@@ -278,6 +278,7 @@ WRITERS = {
     "train": ("train small", "metrics.jsonl"),
     "train quick": ("train quick", "checkpoints"),
     "train imitate": ("train imitate quick", "policy.safetensors"),
+    "train guide": ("train guide", "curve.png"),
     "train compare": ("train compare runs/none", "curves.png"),
     "testsets": ("testsets --sets 3x5", "3x5.jsonl"),
 }

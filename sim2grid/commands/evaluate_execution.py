@@ -99,7 +99,7 @@ class Args(Elevation, Planning, Missions, Apart, Resumable, Reported):
     decision is a target, planned in seconds and driven at any angle (closed; exact in place of
     policies that do not point at targets)."""
     planner: tuple[str, ...] = ("policy",)
-    """Who decides: registered planners (policy, auto, exact, greedy, lns, cpsat, routing,
+    """Who decides: registered planners (policy, auto, exact, greedy, lns, guided, cpsat, routing,
     exhaustive, another package's), or FILE.py:OBJECT, which decides in steps or by the
     clock, as it can."""
     cell: float = 1.0

@@ -54,7 +54,7 @@ class Args(Planning, Missions, Resumable, Reported):
     mode: tuple[Literal["barrier", "async"], ...] = ("async",)
     """barrier: all robots decide together; async: each when it arrives."""
     planner: str = "exact"
-    """Who decides: a registered planner (policy, auto, exact, greedy, lns, cpsat, routing,
+    """Who decides: a registered planner (policy, auto, exact, greedy, lns, guided, cpsat, routing,
     exhaustive, another package's), or FILE.py:OBJECT."""
     side: int = 16
     """Cells of a side of the map, each a metre."""

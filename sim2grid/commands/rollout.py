@@ -71,7 +71,7 @@ class Args(Filmed, Planning, Forced, Printed):
     mission: tyro.conf.Positional[tuple[str, ...]] = ()
     """Mission files (.yaml) or names of bundled missions; not with --from."""
     planner: str | None = None
-    """Who decides: a registered planner (policy, auto, exact, greedy, lns, cpsat, routing,
+    """Who decides: a registered planner (policy, auto, exact, greedy, lns, guided, cpsat, routing,
     exhaustive, another package's), or FILE.py:OBJECT. Default: policy; by the clock exact."""
     mode: Literal["barrier", "async", "clock"] | None = None
     """barrier: all robots decide together; async: each decides when it arrives; clock: a decision

@@ -16,10 +16,10 @@ from moonteam import cli
 from moonteam.commands import options
 from moonteam.report import command
 from moonteam.report.command import Aside
-from training.commands import compare, imitate, refine, train
+from training.commands import compare, guide, imitate, refine, train
 
 TRAIN = {"train imitate": imitate.Args, "train refine": refine.Args,
-         "train compare": compare.Args}
+         "train compare": compare.Args, "train guide": guide.Args}
 KINDS = {name: importlib.import_module(module).Args
          for name, (module, _) in cli.COMMANDS.items() if name != "train"}
 
@@ -96,6 +96,7 @@ def test_every_option_is_written_so_that_it_is_read_back(name):
     "site --centre -120 -35.5 --dem 'the moon.tif' --detrend --no-detail",
     "train compare runs/a runs/b --label GRU --label 'no memory'",
     "train imitate quick --rounds 10 --begin any_team_imitated",
+    "train guide --rounds 10 --population 8",
     "train refine any_team_imitated --reward paper --beside runs/a --beside runs/b",
 ])
 def test_a_line_in_order_is_written_as_it_was(words):

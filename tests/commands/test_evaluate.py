@@ -105,6 +105,28 @@ def test_policies_on_sets_one_row_each(capsys, policy, tmp_path):
     assert main(["evaluate", "sets", "nowhere", "--policy", policy]) == 2
 
 
+def test_rows_against_one_planner_scenario_by_scenario(capsys):
+    words = ["evaluate", "grid", str(GOLDEN), "--limit", "12", "--planner", "exact", "--planner",
+             "greedy", "--objective", "makespan", "--objective", "moves"]
+    document = output(capsys, *words, "--against", "exact", "--json")
+    rows = {row["planner"]: row for row in document["summary"]}
+    assert rows["exact(makespan)"]["against"] is rows["exact(moves)"]["against"] is None
+    for objective in ("makespan", "moves"):
+        one, other = (rows[f"{name}({objective})"] for name in ("greedy", "exact"))
+        assert one["against"] == pytest.approx(one["makespan"] / other["makespan"] - 1.0)
+        low, high = one["intervals"]["against"]
+        assert low <= one["against"] <= high
+    assert rows["greedy(makespan)"]["against"] > 0.0
+    assert main([*words, "--against", "exact", "--markdown"]) == 0
+    assert "| against |" in capsys.readouterr().out
+    assert main([*words, "--markdown"]) == 0
+    assert "| against |" not in capsys.readouterr().out
+    for bad, said in (([*words, "--against", "lns"], "lns is none of the planners: exact, greedy"),
+                      (["evaluate", "grid", "seconds/3x5-7", "--against", "exact"], "in steps")):
+        assert main(bad) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_planners_on_sets_beside_a_policy(capsys, tmp_path):
     words = ["evaluate", "sets", "3x5", "2x3", "--limit", "3", "--planner", "exact", "--planner",
              "lns", "--time-limit", "0.05"]

@@ -30,7 +30,8 @@ def run(capsys, *words):
     return code, *capsys.readouterr()
 
 
-@pytest.mark.parametrize("planner", ["exact", "greedy", "lns", "cpsat", "routing", "exhaustive"])
+@pytest.mark.parametrize("planner", ["exact", "greedy", "lns", "guided", "cpsat", "routing",
+                                     "exhaustive"])
 def test_every_planner_prints_a_document_that_replays(capsys, scenario_set, planner):
     code, out, err = run(capsys, f"{scenario_set}:pair", "--planner", planner, "--json")
     document = json.loads(out)
@@ -39,7 +40,7 @@ def test_every_planner_prints_a_document_that_replays(capsys, scenario_set, plan
                               "seconds", "actions", "schedule"]
     assert (document["makespan"], document["moves"]) == (9, 12)
     assert document["status"] == (
-        "feasible" if planner in ("greedy", "lns", "routing") else "optimal")
+        "feasible" if planner in ("greedy", "lns", "guided", "routing") else "optimal")
     actions = [[ACTIONS.index(name) for name in row] for row in document["actions"]]
     trace = simulate.replay(Snapshot.start(TEAM), actions)
     assert (trace.makespan, trace.moves) == (9, 12)

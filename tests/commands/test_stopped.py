@@ -103,7 +103,7 @@ def test_rows_are_saved_and_gone_on_with(tmp_path, number):
 @pytest.mark.soak
 @pytest.mark.parametrize("seconds", [0.5, 1.5, 4.0, 8.0, 16.0])
 @pytest.mark.parametrize("words", [
-    ("train", "quick"), ("train", "small"), ("train", "imitate", "quick"),
+    ("train", "quick"), ("train", "small"), ("train", "imitate", "quick"), ("train", "guide"),
     ("train", "refine", "any_team_imitated", "--families", "quick"),
     ("evaluate", "execution", "--count", "40"), ("evaluate", "sets"), ("evaluate", "peers"),
     ("rollout", "outpost", "--backend", "native"), ("rollout", "demo"), ("bench", "grid"),

@@ -82,6 +82,27 @@ def test_making_sets_twice_gives_the_same_files(capsys, tmp_path):
                    for s in found)
 
 
+def test_a_set_is_searched_again_and_keeps_what_was_better(capsys, tmp_path):
+    words = ["testsets", "--out", str(tmp_path), "--sets", "8x40"]
+    assert cli.main([*words, "--count", "6", "--iterations", "40", "--starts", "1"]) == 0
+    first = loading.load_set(tmp_path / "8x40.jsonl")
+    assert cli.main([*words, "--better", "--iterations", "2000", "--starts", "1", "--json"]) == 0
+    entry = json.loads(capsys.readouterr().out.splitlines()[-1])["8x40"]
+    assert entry["optima"] == ("best of 1 x 40 iterations of lns, then makespans of 1 x 2000 "
+                               "iterations of guided, with lower bounds")
+    found = loading.load_set(tmp_path / "8x40.jsonl")
+    spans = [[s.optimal.best_makespan for s in some] for some in (first, found)]
+    assert all(b <= a for a, b in zip(*spans, strict=True))
+    assert sum(spans[1]) < sum(spans[0])
+    assert entry["mean_best_makespan"] == round(sum(spans[1]) / 6, 3)
+    for a, b in zip(first, found, strict=True):
+        assert (a.agents, a.targets, a.optimal.best_moves) == (
+            b.agents, b.targets, b.optimal.best_moves)
+    assert cli.main([*words, "--better", "--force"]) == 2
+    assert cli.main(["testsets", "--out", str(tmp_path), "--sets", "5x20", "--better"]) == 2
+    assert "holds no 5x20.jsonl" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["--sets", "9x9"], ["--count", "0"], ["--seed", "-1"],
                                    ["--speeds", "0"]])
 def test_wrong_options_of_testsets(capsys, tmp_path, words):

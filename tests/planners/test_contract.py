@@ -34,7 +34,7 @@ def test_it_keeps_the_contract(name, decode, nearest):
 
 
 @pytest.mark.parametrize("objective", ["moves", "weighted"])
-@pytest.mark.parametrize("name", ["exact", "lns"])
+@pytest.mark.parametrize("name", ["exact", "lns", "guided"])
 def test_it_keeps_the_contract_with_other_objectives(name, objective):
     results = contract.check(name, PlannerOptions(objective, 0.2, 1.0, seed=3))
     assert [r.problem for r in results if not r.passed] == []
@@ -152,7 +152,7 @@ def test_options_are_checked_when_they_are_built(options, says):
 def test_every_option_reaches_its_planner():
     options = PlannerOptions("weighted", 2.0, 3.0, 0.25, 7, "any_team_imitated", "best-of-8@0.25",
                              0.5)
-    for name in ("exact", "greedy", "lns", "exhaustive"):
+    for name in ("exact", "greedy", "lns", "guided", "exhaustive"):
         planner = registry.make(name, options)
         assert (planner.objective, planner.alpha, planner.beta) == ("weighted", 2.0, 3.0)
         if registry.find(name).anytime:

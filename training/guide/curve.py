@@ -14,7 +14,7 @@ def draw_curve(path: Path, rows: list[Row]) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import PercentFormatter
 
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     looks = [row for row in rows if "practices" in row]
@@ -24,7 +24,7 @@ def draw_curve(path: Path, rows: list[Row]) -> None:
                   label=practice["practice"])
     axis.axhline(0.0, color="0.5", linewidth=0.8)
     axis.set_xlabel("minutes of training")
-    axis.set_title("makespan of searches that take as long, over those by the plain guide")
+    axis.set_title("makespan over the plain guide's in as much time")
     axis.yaxis.set_major_formatter(PercentFormatter(1.0))
     axis.grid(alpha=0.3)
     figure.legend(fontsize=7, loc="outside right upper")

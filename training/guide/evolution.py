@@ -116,7 +116,8 @@ class Guider:
         """One generation."""
         config, number = self.config, at.total_updates
         drawing, telling = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), number))
-        candidates, asked = self.rule.ask(drawing, self.searcher, self.numbers)
+        with jax.numpy_rank_promotion("allow"):  # evosax relies on it
+            candidates, asked = self.rule.ask(drawing, self.searcher, self.numbers)
         guides = [self.guide(one) for one in np.asarray(candidates)]
         costs = np.zeros(len(guides) + 1)
         with ThreadPoolExecutor(cores()) as pool:
@@ -129,8 +130,9 @@ class Guider:
                     [*guides, PLAIN])))
         costs /= sum(p.weight for p in config.practices)
         fitness = costs[:-1] - costs[-1]
-        self.searcher, _ = self.rule.tell(telling, candidates, jnp.asarray(fitness, jnp.float32),
-                                          asked, self.numbers)
+        with jax.numpy_rank_promotion("allow"):
+            self.searcher, _ = self.rule.tell(
+                telling, candidates, jnp.asarray(fitness, jnp.float32), asked, self.numbers)
         return Made(1, self.searches, {
             "candidates": float(fitness.mean()), "best": float(fitness.min()),
             "sigma": float(self.searcher.std)})

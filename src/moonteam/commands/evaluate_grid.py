@@ -46,6 +46,7 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
       moonteam evaluate grid set.jsonl --planner exact --objective makespan --objective moves
       moonteam evaluate grid peers/mrta-benchmark --planner exact --planner greedy
       moonteam evaluate grid 8x40 --planner lns --time-limit 0.01 --time-limit 0.1 --limit 20
+      moonteam evaluate grid 5x20 --planner lns --planner guided --time-limit 0.01 --against lns
       moonteam evaluate grid --count 500 --targets 3 --side 8 --max-steps 48 --planner policy
       --policy small --decode argmax --decode best-of-16
       moonteam evaluate grid 8x40 --planner lns --planner cpsat --on ray
@@ -55,7 +56,7 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     """Scenario set (.jsonl), scenario (.json), or the name of a bundled set; without it,
     --count scenarios are drawn from --seed."""
     planner: Many[tuple[str, ...]] = ()
-    """auto, exact, greedy, lns, exhaustive, cpsat, routing, policy, another package's, or
+    """auto, exact, greedy, lns, guided, exhaustive, cpsat, routing, policy, another package's, or
     FILE.py:OBJECT; again for more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves (by the clock: effort) or weighted; again for more rows. Default: makespan,
@@ -76,10 +77,13 @@ class Args(Drawn, Limited, Apart, Resumable, Reported):
     beta: float = 0.05
     """Weight of the moves in the objective weighted."""
     time_limit: Many[tuple[float, ...]] = ()
-    """Seconds a scenario that anytime planners (exact, lns, cpsat, routing) may take; again for
+    """Seconds a scenario that anytime planners (exact, lns, guided, cpsat, ...) may take; again for
     more rows. Default: theirs."""
+    against: str = ""
+    """A planner among the rows, such as lns: every other row of its objective and time limit is
+    held against it too, scenario by scenario, by mean makespan. In steps only."""
     threads: int = 1
-    """That lns and auto search with side by side."""
+    """That lns, guided and auto search with side by side."""
 
 
 def load_any(name: str, limit: int | None) -> list[Scenario] | list[Timed]:
@@ -177,17 +181,20 @@ def judged(args: Args, found: Sequence[Scenario | Timed], title: str, line: str,
         options = options_of(args)
         asked = command.figures(args) | ({"made": made} if made else {})
         kept = journal.Kept.of(args.out, args.resume, asked, FILES)
-        return _judged(found, options, args.seed, title, line, kept, workers)
+        return _judged(found, options, args.seed, title, line, kept, workers, args.against)
 
 
-def _judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str,
-            line: str, kept: Kept, workers: Cluster | None) -> tuple[dict, Any]:
+def _judged(found: Sequence[Scenario | Timed], options: Any, seed: int, title: str, line: str,
+            kept: Kept, workers: Cluster | None, against: str) -> tuple[dict, Any]:
     from moonteam.evaluation import contenders, grid, timed
 
     clocked = [one for one in found if isinstance(one, Timed)]
+    if against and (clocked or against not in options.planners):
+        raise InputError("--against", "is for scenarios in steps" if clocked else
+                         f"{against} is none of the planners: {', '.join(options.planners)}")
     if clocked:
         return timed.evaluate(clocked, timed.contenders(options), seed, title, line, kept,
                               workers), timed
     steps = [one for one in found if isinstance(one, Scenario)]
     return grid.evaluate(steps, contenders.contenders(options), seed, title, line, kept,
-                         workers), grid
+                         workers, against), grid

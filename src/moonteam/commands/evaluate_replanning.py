@@ -39,8 +39,8 @@ class Args(Drawn, Limited, Resumable, Reported):
     set: tyro.conf.Positional[str | None] = None
     """Scenario set (.jsonl) or the name of a bundled one."""
     planner: Many[tuple[str, ...]] = ()
-    """auto, exact, greedy, lns, policy, another package's, or FILE.py:OBJECT; again for more rows.
-    Default: exact."""
+    """auto, exact, greedy, lns, guided, policy, another package's, or FILE.py:OBJECT; again for
+    more rows. Default: exact."""
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves or weighted; again for more rows. Default: makespan."""
     policy: Many[tuple[str, ...]] = ()
@@ -54,7 +54,7 @@ class Args(Drawn, Limited, Resumable, Reported):
     new: int = 5
     """How many of a scenario's targets appear later; without SET, that many more than --targets."""
     time_limit: Many[tuple[float, ...]] = ()
-    """Seconds a plan that anytime planners (exact, lns, cpsat, routing) may take; again for
+    """Seconds a plan that anytime planners (exact, lns, guided, cpsat, ...) may take; again for
     more rows. Default: theirs."""
 
 

@@ -48,7 +48,7 @@ class Args(Seeded, Limited, Resumable, Reported):
     sets: tyro.conf.Positional[tuple[str, ...]] = ()
     """Bundled sets or files (.jsonl); all bundled ones if not given."""
     planner: Many[tuple[str, ...]] = ()
-    """policy, auto, exact, greedy, lns, exhaustive, cpsat, routing, another package's, or
+    """policy, auto, exact, greedy, lns, guided, exhaustive, cpsat, routing, another package's, or
     FILE.py:OBJECT; again for more. Default: policy."""
     policy: Many[tuple[str, ...]] = ()
     """Policy file (.safetensors) or the name of a bundled policy; again for more. Default:
@@ -56,7 +56,7 @@ class Args(Seeded, Limited, Resumable, Reported):
     best_of: int = 16
     """K, sampled rollouts a scenario."""
     time_limit: float | None = None
-    """Seconds a scenario that anytime planners (exact, lns, cpsat, routing) may take. Default:
+    """Seconds a scenario that anytime planners (exact, lns, guided, cpsat, ...) may take. Default:
     theirs."""
 
 

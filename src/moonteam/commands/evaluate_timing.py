@@ -35,7 +35,7 @@ class Args(Seeded, Reported):
     objective: Many[tuple[str, ...]] = ()
     """makespan, moves or weighted; again for more. Default: all of exact's, else makespan."""
     time_limit: float | None = None
-    """Seconds a plan that anytime planners (exact, lns, cpsat, routing) may take. Default:
+    """Seconds a plan that anytime planners (exact, lns, guided, cpsat, ...) may take. Default:
     theirs."""
     policy: str | None = None
     """Policy file or bundled policy. A recurrent network is rebuilt, untrained, for each number

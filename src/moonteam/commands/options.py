@@ -225,7 +225,7 @@ class Planning:
     beta: float = 0.05
     """Weight of the moves in the objective weighted."""
     time_limit: float | None = None
-    """Seconds after which exact, lns, cpsat and routing return the best plan they have."""
+    """Seconds after which exact, lns, guided, cpsat and routing return the best plan they have."""
     policy: str = "any_team"
     """Policy file (.safetensors) or the name of a bundled policy, for --planner policy."""
     decode: str = "argmax"

@@ -50,14 +50,15 @@ class Args(Planning, Saved, Printed):
     scenario: tyro.conf.Positional[str]
     """Scenario, set.jsonl:INDEX or set.jsonl:ID, or mission."""
     planner: str = "exact"
-    """auto (exact if that is certified in half of the time, else local search; it says which and
+    """auto (exact if that is certified in half of the time, else guided or lns; it says which and
     why), exact (proves its plan the best; up to 12 targets), greedy, lns (large-neighbourhood
-    search), cpsat and routing (need the extra ortools), exhaustive (up to 6 targets), policy,
-    another package's, or FILE.py:OBJECT."""
+    search), guided (in steps; lns that learned what to take out and how to put it back), cpsat and
+    routing (need the extra ortools), exhaustive (up to 6 targets), policy, another package's, or
+    FILE.py:OBJECT."""
     seed: int = 0
-    """Seed of lns and of a policy that samples."""
+    """Seed of lns, of guided and of a policy that samples."""
     threads: int = 1
-    """That lns and auto search with side by side."""
+    """That lns, guided and auto search with side by side."""
     clock: Literal["steps", "seconds"] | None = None
     """steps: one cell a decision; seconds: a mission on its ground, at any angle, each kind at its
     own speed. Default: as the file says."""

@@ -18,15 +18,18 @@ from moonteam.report.journal import NOTHING, Kept
 PANELS = (("makespan_gap", "makespan over the optimum, %", 100.0),
           ("moves_gap", "moves over the optimum, %", 100.0),
           ("success", "success", 1.0))
-COLUMNS = (*tables.GRID_COLUMNS, *tables.SECONDS)
+AGAINST = tables.Column("against", "against", lambda value: f"{100 * value:+.2f} %")
+COLUMNS = (*tables.GRID_COLUMNS, AGAINST, *tables.SECONDS)
 PAGE = tuple(c for c in COLUMNS if c.key not in ("M_st", "M_tte", "decisions"))
 """Columns of the Markdown table, which must not be too wide; the others follow from them."""
 
 
 def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int, title: str,
-             command: str, kept: Kept = NOTHING, cluster: Cluster | None = None) -> dict:
+             command: str, kept: Kept = NOTHING, cluster: Cluster | None = None,
+             against: str = "") -> dict:
     """The whole report as a JSON-able document, of work done here or on a cluster; `kept` holds
-    what was done before.
+    what was done before. `against`: a planner that others of its objective and time limit are held
+    against.
 
     Raises InputError before anything is run. Interrupted, it reports the rows that are done
     (see `run_all`).
@@ -38,7 +41,8 @@ def evaluate(scenarios: Sequence[Scenario], rows: Sequence[Contender], seed: int
                              lambda row, size, kept: row.parts(world, size, kept))
     found = run_all(whole, world, kept=kept)
     reference = optima.reference(world.scenarios)
-    return document(world.family, found, reference, seed, title, command) | missing(found, rows)
+    return document(world.family, found, reference, seed, title, command,
+                    against) | missing(found, rows)
 
 
 def run_all(rows: Sequence[Contender], world: World, least: int = 1,
@@ -62,16 +66,25 @@ def missing(found: Sequence[metrics.Outcomes], rows: Sequence[Contender]) -> dic
 
 
 def document(family: metrics.Family, found: Sequence[metrics.Outcomes],
-             reference: metrics.Reference, seed: int, title: str, command: str) -> dict:
-    """Summary, rows, notes and provenance."""
+             reference: metrics.Reference, seed: int, title: str, command: str,
+             against: str = "") -> dict:
+    """Summary, rows, notes and provenance; `against` as in `evaluate`."""
     bootstrap = Bootstrap(len(family), seed)
     notes = [f"Measured against: {reference.source}.",
              f"In brackets: 95 % intervals over {len(family)} scenarios: of success by Wilson, "
              f"else bootstrap, {RESAMPLES} resamples.",
              *(f"{o.planner}: {o.note}" for o in found if o.note)]
+    summary = [metrics.summary(o, family, reference, bootstrap) for o in found]
+    if against:
+        notes.append(f"Against {against}: mean makespan over that of {against} with the same "
+                     "objective and time limit, the same scenarios resampled.")
+        by_name = {o.planner: o for o in found}
+        for row, one in zip(summary, found, strict=True):
+            other = by_name.get(against + one.planner[one.planner.find("("):])
+            metrics.hold_against(row, one, None if other is one else other, bootstrap)
     return {
         "title": title,
-        "summary": [metrics.summary(o, family, reference, bootstrap) for o in found],
+        "summary": summary,
         "rows": [row for o in found for row in metrics.rows(o, family, reference)],
         "notes": [note for note in notes if note],
         "meta": provenance.meta(command, seed),

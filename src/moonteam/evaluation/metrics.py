@@ -104,6 +104,15 @@ def summary(outcomes: Outcomes, family: Family, reference: Reference,
     return row
 
 
+def hold_against(row: dict, outcomes: Outcomes, other: Outcomes | None,
+                 bootstrap: Bootstrap) -> None:
+    """Adds to a summary row its mean makespan over another's, less one; None if there is none."""
+    row["against"] = None
+    if other is not None:
+        value, low, high = (v - 1.0 for v in bootstrap.ratio(outcomes.steps, other.steps))
+        row["against"], row["intervals"]["against"] = value, [low, high]
+
+
 def rows(outcomes: Outcomes, family: Family, reference: Reference) -> list[dict]:
     """One row a scenario; `makespan` is None where the planner failed."""
     found = []

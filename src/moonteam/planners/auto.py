@@ -1,4 +1,4 @@
-"""The planner that chooses by itself: exact where that is done in time, else local search."""
+"""The planner that chooses by itself: exact where that is done in time, else guided search."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from moonteam.planners.base import Objective, Plan, Snapshot, check_objective
 from moonteam.planners.exact import ExactPlanner
+from moonteam.planners.guided import GuidedPlanner
 from moonteam.planners.kind import PlannerKind, PlannerOptions
-from moonteam.planners.lns import LnsPlanner
 from moonteam.planners.plans.follow import PlanFollower, compiled
 
 LIMIT = 1.0
@@ -48,7 +48,7 @@ class AutoPlanner(PlanFollower):
     def plan(self, snapshot: Snapshot) -> Plan:
         """A whole plan from this moment. Raises InputError if no planner can serve it."""
         compiled(ExactPlanner)
-        compiled(LnsPlanner)
+        compiled(GuidedPlanner)
         began = time.perf_counter()
         goal = self.objective, self.alpha, self.beta
         count = int((~snapshot.solved).sum())
@@ -59,8 +59,8 @@ class AutoPlanner(PlanFollower):
                 return _said(first, "certified") if first.status == "optimal" else first
             why = f"{count} targets were not certified within {SHARE * self.time_limit:g} s"
         left = max(self.time_limit - (time.perf_counter() - began), 1e-3)
-        plan = LnsPlanner(*goal, time_limit=left, seed=self.seed,
-                          threads=self.threads).plan(snapshot)
+        plan = GuidedPlanner(*goal, time_limit=left, seed=self.seed,
+                             threads=self.threads).plan(snapshot)
         if first is not None:
             bound = max((b for b in (first.bound, plan.bound) if b is not None), default=None)
             better = min((plan, first), key=self._value)

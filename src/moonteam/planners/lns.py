@@ -218,6 +218,8 @@ class LnsPlanner(InsertionPlanner):
     """
 
     name = "lns"
+    guide: Floats = PLAIN
+    """What is taken out and how it is put back, see `search.neighbourhoods`."""
 
     def __init__(self, objective: Objective = "makespan", alpha: float = 1.0, beta: float = 0.05,
                  iterations: int | None = None, time_limit: float | None = None, seed: int = 0,
@@ -237,7 +239,8 @@ class LnsPlanner(InsertionPlanner):
 
     def _improved(self, task: Task, goal: Weights, events: Events, began: float) -> Events:
         until = None if self.time_limit is None else began + self.time_limit
-        return improve(task, goal, events, self.seed, self.iterations, until, self.threads)
+        return improve(task, goal, events, self.seed, self.iterations, until, self.threads,
+                       self.guide)
 
 
 def _planner(options: PlannerOptions) -> LnsPlanner:

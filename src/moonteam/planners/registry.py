@@ -24,8 +24,9 @@ from moonteam.registry import Registry
 _HERE = "moonteam.planners"
 _REGISTRY: Registry[object] = Registry("planner", _HERE, object, {
     "exact": f"{_HERE}.exact:PLANNER", "greedy": f"{_HERE}.greedy:PLANNER",
-    "lns": f"{_HERE}.lns:PLANNER", "cpsat": f"{_HERE}.cpsat:PLANNER",
-    "routing": f"{_HERE}.routing:PLANNER", "exhaustive": f"{_HERE}.exhaustive:PLANNER",
+    "lns": f"{_HERE}.lns:PLANNER", "guided": f"{_HERE}.guided:PLANNER",
+    "cpsat": f"{_HERE}.cpsat:PLANNER", "routing": f"{_HERE}.routing:PLANNER",
+    "exhaustive": f"{_HERE}.exhaustive:PLANNER",
     "policy": f"{_HERE}.policy:PLANNER", "auto": f"{_HERE}.auto:PLANNER"})
 
 

@@ -27,6 +27,7 @@ from moonteam.planners.search.insertion import (
     put,
 )
 from moonteam.planners.search.teams import Teams
+from moonteam.planners.search.travel import UNREACHABLE
 
 W, B, G = 4, 3, 4
 SHAPES = {"ways": (W, G), "size": (W, 3), "seed": (W, 5), "near": (W, 9), "back": (B, G),
@@ -100,6 +101,19 @@ def drawn(logits, moment):
         if left < 0.0:
             return i
     return logits.shape[0] - 1
+
+
+@njit(**LOOP)
+def mean_way(ways):
+    """Steps between two targets in the mean, of those that have a way."""
+    total, count = 0, 0
+    for k in range(ways.between.shape[0]):
+        for i in range(ways.between.shape[1]):
+            for j in range(ways.between.shape[2]):
+                if ways.between[k, i, j] < UNREACHABLE:
+                    total += ways.between[k, i, j]
+                    count += 1
+    return max(1.0, total / max(1, count))
 
 
 @njit(**LOOP)
@@ -226,7 +240,7 @@ def improve(guide, ways, teams, order, crew, alpha, beta, true_alpha, true_beta,
     line, removed = empty(ways, teams), np.zeros(m, np.bool_)
     look = Look(np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m))
     moment = of_moment(n, m)
-    stride = max(1.0, ways.between[0].mean())
+    stride = mean_way(ways)
     line.order[:], line.crew[:] = best_order, best_crew
     makespan, moves = measure(ways, teams, line, m)
     best = price(makespan, moves, true_alpha, true_beta, horizon)
