@@ -21,7 +21,8 @@ from moonteam.problem import timed
 LOADED = 5.0
 TRIES = 3
 SIZES = {"3x7": (3, 7, 32), "20x12": (20, 12, 48), "8x40": (8, 40, 40), "20x100": (20, 100, 48)}
-PLANNERS = dict.fromkeys(("steps", "seconds"), ("exact", "cpsat", "lns", "auto"))
+PLANNERS = {"steps": ("exact", "cpsat", "lns", "guided", "auto"),
+            "seconds": ("exact", "cpsat", "lns", "auto")}
 
 
 def scenario(size):
