@@ -19,7 +19,7 @@ from moonteam.planners.base import IntArray, Objective, Snapshot
 from moonteam.planners.kind import PlannerKind, PlannerOptions
 from moonteam.planners.plans.follow import Answer, RoutePlanner
 from moonteam.planners.search import insertion, neighbourhoods
-from moonteam.planners.search.bounds import lower_bounds
+from moonteam.planners.search.bounds import HASTY, ROUNDS, lower_bounds
 from moonteam.planners.search.guides import PLAIN, Floats
 from moonteam.planners.search.insertion import Ways
 from moonteam.planners.search.task import Task, value_of, weights
@@ -31,7 +31,7 @@ MAX_AGENTS = 62
 _STEER = 0.05  # weight of moves while searching for makespan: it breaks ties on plateaus
 _BLOCK = 250  # iterations between looks at the clock, at most
 _FIRST, _SLICE = 5, 0.02  # the first so many; s that they then may take
-_HURRY = 0.1  # s; with less the first plan is made in one way only
+_HURRY = 0.1  # s; with less the first plan is made in one way only, and bounds are looser
 _LARGE = 60  # targets above which insertion looks at few anew each time
 
 
@@ -189,12 +189,12 @@ class InsertionPlanner(RoutePlanner):
         if agents > MAX_AGENTS:
             raise InputError(f"--planner {self.name}",
                              f"{agents} agents; at most {MAX_AGENTS} are allowed")
-        low_makespan, low_moves = lower_bounds(task)
+        hurry = self.time_limit is not None and self.time_limit < _HURRY
+        low_makespan, low_moves = lower_bounds(task, rounds=HASTY if hurry else ROUNDS)
         bound = value_of(self.objective, self.alpha, self.beta, low_makespan, low_moves)
         if low_makespan > task.horizon:
             return Answer(None, bound, True)
         goal = Weights.of(self.objective, self.alpha, self.beta, task)
-        hurry = self.time_limit is not None and self.time_limit < _HURRY
         events = self._improved(task, goal, best_insertion(task, goal, hurry), began)
         if measure(task, events)[0] > task.horizon:
             return Answer(None, bound, False)

@@ -16,6 +16,7 @@ from moonteam.planners.search.teams import teams_of
 from moonteam.planners.search.travel import UNREACHABLE
 
 ROUNDS = 300  # subgradient steps; more add little
+HASTY = 30  # the same for a plan that is due in milliseconds
 PART = 9  # targets of the parts solved exactly
 
 
@@ -96,7 +97,7 @@ def earliest(start, first, members):
     return farthest
 
 
-def lower_bounds(task: Task, parts: int = 0) -> tuple[int, int]:
+def lower_bounds(task: Task, parts: int = 0, rounds: int = ROUNDS) -> tuple[int, int]:
     """(makespan, moves) that no plan can beat; ignores the horizon.
 
     The moves' bound shared evenly among the team also bounds the makespan.
@@ -105,13 +106,14 @@ def lower_bounds(task: Task, parts: int = 0) -> tuple[int, int]:
       task: what is to be done; must be feasible.
       parts: so many parts of 9 targets, drawn at random, are solved exactly as well: leaving
         targets out can only make a plan cheaper.
+      rounds: of raising the bound of the moves.
     """
     if not len(task.targets):
         return 0, 0
     teams = teams_of(task.start, task.skills, task.need, task.both)
     makespan = int(earliest(task.start, teams.first, teams.members))
     moves = math.ceil(forest_bound(task.start, task.between, task.kinds, task.skills, task.need,
-                                   task.both, ROUNDS) - 1e-6)
+                                   task.both, rounds) - 1e-6)
     rng = np.random.default_rng(0)
     count = len(task.targets)
     for _ in range(parts):

@@ -10,6 +10,8 @@ back. `guides` tells where guides come from.
 
 from __future__ import annotations
 
+import math
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +35,7 @@ W, B, G = 4, 3, 4
 SHAPES = {"ways": (W, G), "size": (W, 3), "seed": (W, 5), "near": (W, 9), "back": (B, G),
           "row": (6,), "place": (4, G), "heat": (2, G)}
 """Of a guide's weights, in the order in which they stand in its vector."""
+_ENDS = tuple(accumulate(math.prod(shape) for shape in SHAPES.values()))
 DRAWN = 3
 """Events that the one is chosen from at which taking out begins."""
 
@@ -66,10 +69,10 @@ class Look(NamedTuple):
 def guide_of(vector):
     """A guide of its vector, the shapes one after the other."""
     return Guide(
-        vector[0:16].reshape((W, G)), vector[16:28].reshape((W, 3)),
-        vector[28:48].reshape((W, 5)), vector[48:84].reshape((W, 9)),
-        vector[84:96].reshape((B, G)), vector[96:102], vector[102:118].reshape((4, G)),
-        vector[118:126].reshape((2, G)))
+        vector[:_ENDS[0]].reshape((W, G)), vector[_ENDS[0]:_ENDS[1]].reshape((W, 3)),
+        vector[_ENDS[1]:_ENDS[2]].reshape((W, 5)), vector[_ENDS[2]:_ENDS[3]].reshape((W, 9)),
+        vector[_ENDS[3]:_ENDS[4]].reshape((B, G)), vector[_ENDS[4]:_ENDS[5]],
+        vector[_ENDS[5]:_ENDS[6]].reshape((4, G)), vector[_ENDS[6]:].reshape((2, G)))
 
 
 @njit(cache=True, nogil=True)
@@ -101,6 +104,15 @@ def drawn(logits, moment):
         if left < 0.0:
             return i
     return logits.shape[0] - 1
+
+
+@njit(**LOOP)
+def size_of(teams, coalition):
+    """Its members."""
+    size = 0
+    for s in range(teams.members.shape[1]):
+        size += teams.members[coalition, s] >= 0
+    return size
 
 
 @njit(**LOOP)
@@ -183,16 +195,36 @@ def choose_removed(guide, moment, teams, ways, order, crew, look, stride, remove
         steps = (near[0] * apart + near[1] * look.slack[i]
                  + near[2] * abs(look.at[i] - look.at[seed]) + near[4] * look.detour[i]
                  + near[5] * look.wait[i])
-        mask, members = teams.masks[crew[i]], 0
-        for s in range(teams.members.shape[1]):
-            members += teams.members[crew[i], s] >= 0
-        score[i] = (steps / stride + near[3] * (1 - (mask >> mate & 1)) + near[6] * members
-                    + near[7] * np.random.random() + near[8] * (look.slack[i] <= 0))
+        apart_from_mate = 1 - (teams.masks[crew[i]] >> mate & 1)
+        score[i] = (steps / stride + near[3] * apart_from_mate
+                    + near[6] * size_of(teams, crew[i]) + near[7] * np.random.random()
+                    + near[8] * (look.slack[i] <= 0))
     score[seed] = -np.inf
     for _ in range(wanted):
         nearest = np.argmin(score)
         removed[nearest], score[nearest] = True, np.inf
     return wanted
+
+
+@njit(**LOOP)
+def take_out(guide, teams, order, crew, look, stride, removed, line, missing, key):
+    """Fills `line` with the events that stay, and returns how many; the targets of the others go
+    into `missing`, and into `key` when each is to come back, the least first.
+    """
+    row, length, out = guide.row, 0, 0
+    for i in range(order.shape[0]):
+        if not removed[i]:
+            line.order[length], line.crew[length] = order[i], crew[i]
+            length += 1
+            continue
+        t = order[i]
+        choices = teams.first[t + 1] - teams.first[t]
+        key[out] = ((row[2] * look.slack[i] + row[3] * look.detour[i] + row[4] * look.at[i])
+                    / stride + row[5] * np.random.random() + row[0] * np.log(choices)
+                    + row[1] * size_of(teams, crew[i]))
+        missing[out] = t
+        out += 1
+    return length
 
 
 @njit(**LOOP)
@@ -259,22 +291,7 @@ def improve(guide, ways, teams, order, crew, alpha, beta, true_alpha, true_beta,
         moment[1] = done - 0.5
         warmth = unit * np.exp((1.0 - done) * hot + done * cold)
         count = choose_removed(guide, moment, teams, ways, order, crew, look, stride, removed)
-        length, out = 0, 0
-        for i in range(m):
-            if removed[i]:
-                missing[out] = order[i]
-                row, t = guide.row, order[i]
-                members = 0
-                for a in teams.members[crew[i]]:
-                    members += a >= 0
-                key[out] = ((row[2] * look.slack[i] + row[3] * look.detour[i]
-                             + row[4] * look.at[i]) / stride + row[5] * np.random.random()
-                            + row[0] * np.log(teams.first[t + 1] - teams.first[t])
-                            + row[1] * members)
-                out += 1
-            else:
-                line.order[length], line.crew[length] = order[i], crew[i]
-                length += 1
+        length = take_out(guide, teams, order, crew, look, stride, removed, line, missing, key)
         hold = alpha * max(0.0, weigh(guide.place[0], moment))
         noise = 0.0
         if np.random.random() * (1.0 + np.exp(-weigh(guide.place[1], moment))) < 1.0:
