@@ -1,7 +1,7 @@
 """Plans for large teams and many targets: insertion with regret, then large neighbourhoods.
 
 Anytime: there is a plan after the first insertion, and it gets better with every iteration.
-The search itself is in `insertion`.
+The search itself is in `search.neighbourhoods`, what steers it in `search.guides`.
 """
 
 from __future__ import annotations
