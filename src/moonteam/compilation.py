@@ -186,6 +186,10 @@ def _keep_whole_entries() -> None:
     LRUCache.put = put_whole
 
 
+LOOP: Any = {"cache": True, "nogil": True, "_nrt": False}
+"""`njit` options of inner loops: they make no arrays, and count no references to those they get."""
+
+
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Numba's decorator, without its cache where that has nowhere to be, or no room."""
     import numba

@@ -11,8 +11,6 @@ from training.commands.ending import Taught, complete
 from training.guide.recipe import Guiding
 from training.run.machine import Run
 
-GUIDE = "guide"
-
 
 @dataclass(frozen=True)
 class Args(Taught):
@@ -48,7 +46,7 @@ def run(args: Args) -> int:
                              f"{value} is not allowed; at least {least}")
     config = Guiding(population=args.population, rounds=args.rounds, held_out=args.held_out,
                      seed=args.seed)
-    out = args.folder(GUIDE, args.seed)
+    out = args.folder("guide", args.seed)
     if args.dry_run:
         return dry.show(*dry.guiding(config), out, args.json)
     from training.guide.evolution import Guider

@@ -11,8 +11,9 @@ candidates' distribution; generation and seed alone say what comes next.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from moonteam.planners.search.travel import travel_times
 from moonteam.policies.policy_file import PolicyFile
 from training.guide.curve import draw_curve
 from training.guide.recipe import STEPS, Guiding, Practice
-from training.run.trainee import Made, Position, Row
+from training.run.trainee import Made, Position, Row, due
 
 EVAL_EVERY = 25
 """Generations; more often in a short run, for a curve of eight points."""
@@ -125,9 +126,8 @@ class Guider:
                 first = _FRESH + (number * len(config.practices) + i) * 100
                 problems = [Problem.drawn(practice, config.seed * _APART + first + k)
                             for k in range(practice.problems)]
-                costs += practice.weight * np.array(list(pool.map(
-                    lambda guide: _cost(problems, guide, practice.places, first),  # noqa: B023
-                    [*guides, PLAIN])))
+                cost = partial(_cost, problems, practice.places, first)
+                costs += practice.weight * np.array(list(pool.map(cost, [*guides, PLAIN])))
         costs /= sum(p.weight for p in config.practices)
         fitness = costs[:-1] - costs[-1]
         with jax.numpy_rank_promotion("allow"):
@@ -145,19 +145,16 @@ class Guider:
             few = practice.places > _LONG or practice.targets > 100
             count = max(1, self.config.held_out // (8 if few else 1))
             problems = [Problem.drawn(practice, _HELD + 1000 * i + k) for k in range(count)]
-            out.append((practice, problems, _makespans(problems, PLAIN, practice.places, i)))
+            out.append((practice, problems, _all_cores(problems, PLAIN, practice.places, i)))
         return out
 
     def held_out(self, at: Position) -> dict[str, Any]:
         """Makespans against those by the plain guide; before the first generation too."""
-        config = self.config
-        often = max(1, min(EVAL_EVERY, config.rounds // 8))
-        if at.update % often and at.update < config.rounds:
+        if not due(at, self.config.rounds, EVAL_EVERY):
             return {}
-        guide = self.guide(self.searcher.mean if at.update else np.zeros(self.moving.sum()))
-        rows = []
+        guide, rows = self.guide(self.searcher.mean), []
         for i, (practice, problems, plain) in enumerate(self._held):
-            found = _makespans(problems, guide, practice.places, i)
+            found = _all_cores(problems, guide, practice.places, i)
             rows.append({"practice": practice.name, "weight": practice.weight,
                          "makespan": float(found.mean()), "plain": float(plain.mean()),
                          "over_plain": float(np.log(found / plain).mean())})
@@ -223,15 +220,19 @@ def over_plain(row: Row) -> float:
             / sum(r["weight"] for r in rows))
 
 
-def _makespans(problems: list[Problem], guide: Floats, places: int, seed: int) -> Floats:
-    """[problems] by searches of so many places."""
+def _makespans(problems: list[Problem], guide: Floats, places: int, seed: int,
+               each: Callable[..., Iterable[int]] = map) -> Floats:
+    """[problems] by searches of so many places; `each` is `map`, or a pool's."""
+    return np.array(list(each(lambda problem, k: problem.makespan(guide, places, seed + k),
+                              problems, range(len(problems)))), np.float64)
+
+
+def _all_cores(problems: list[Problem], guide: Floats, places: int, seed: int) -> Floats:
+    """The same on all cores."""
     with ThreadPoolExecutor(cores()) as pool:
-        return np.array(list(pool.map(
-            lambda pair: pair[1].makespan(guide, places, seed + pair[0]), enumerate(problems))),
-            np.float64)
+        return _makespans(problems, guide, places, seed, pool.map)
 
 
-def _cost(problems: list[Problem], guide: Floats, places: int, seed: int) -> float:
-    """Mean logarithm of the makespans."""
-    return float(np.mean([np.log(problem.makespan(guide, places, seed + k))
-                          for k, problem in enumerate(problems)]))
+def _cost(problems: list[Problem], places: int, seed: int, guide: Floats) -> float:
+    """Mean logarithm of the makespans, in one thread."""
+    return float(np.log(_makespans(problems, guide, places, seed)).mean())

@@ -27,6 +27,13 @@ class Position:
     """Spent in chunks; evaluations and compiling apart."""
 
 
+def due(at: Position, updates: int, every: int) -> bool:
+    """Whether to look at a phase of so many updates now: every so many, more often in a short one,
+    for a curve of eight points, and at its end.
+    """
+    return at.update >= updates or at.update % max(1, min(every, updates // 8)) == 0
+
+
 class Made(NamedTuple):
     """What a chunk came to."""
 

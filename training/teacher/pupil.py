@@ -21,7 +21,7 @@ from jax import Array
 from moonteam.policies.entity import EntitySpec
 from moonteam.policies.policy_file import PolicyFile
 from training.run.families import mean
-from training.run.trainee import Made, Position, Row
+from training.run.trainee import Made, Position, Row, due
 from training.sharding import everywhere, gather, mesh_for
 from training.teacher.curve import draw_curve
 from training.teacher.families import Family, Sample, Walk, begin, make_ground, spread_walk
@@ -184,8 +184,7 @@ class Pupil(ABC):
     def held_out(self, at: Position) -> dict[str, Any]:
         """Success and gaps of each family; before the first round too, and after the last."""
         config = self.config
-        often = max(1, min(EVAL_EVERY, config.rounds // 8))
-        if at.update % often and at.update < config.rounds:
+        if not due(at, config.rounds, EVAL_EVERY):
             return {}
         return {"round": at.update, "labelled": at.update * self.states_a_round,
                 "families": [family_row(f, h, config.spec, self.learner.mean)

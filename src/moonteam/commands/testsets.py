@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from moonteam.commands import testsets_seconds, testsets_unfolding
 from moonteam.commands.options import Forced, Printed
 from moonteam.errors import InputError, not_one_of
 from moonteam.problem import timed
-from moonteam.problem.scenario import Optimal, Scenario, save_set
+from moonteam.problem.scenario import Optimal, Scenario, load_set, save_set
 from moonteam.report import progress
 
 if TYPE_CHECKING:
@@ -157,8 +156,8 @@ def best_known(scenario: Scenario, iterations: int, starts: int) -> Optimal | No
                    bound_makespan=low_makespan, bound_moves=low_moves)
 
 
-def bettered(scenario: Scenario, iterations: int, starts: int) -> Scenario:
-    """The scenario with the least makespan that is known once guided search has had its turn."""
+def bettered(scenario: Scenario, iterations: int, starts: int) -> Optimal:
+    """What is known of a scenario once guided search for its makespan has had its turn."""
     from moonteam.planners.base import Snapshot
     from moonteam.planners.guided import GuidedPlanner
 
@@ -167,28 +166,22 @@ def bettered(scenario: Scenario, iterations: int, starts: int) -> Scenario:
              for s in range(starts)]
     makespans = [value for value in (known.best_makespan, *(p.makespan for p in plans))
                  if value is not None]
-    return msgspec.structs.replace(scenario, optimal=msgspec.structs.replace(
-        known, best_makespan=min(makespans, default=None)))
+    return msgspec.structs.replace(known, best_makespan=min(makespans, default=None))
 
 
 def better(recipe: Recipe, args: Args, update: Callable[[int, str], None],
            before: dict[str, Any]) -> dict[str, Any]:
     """Searches a set again, on all cores; what the index says about it then."""
-    from moonteam.compilation import cores
-    from moonteam.problem.scenario import load_set
-
-    path, out = args.out / f"{recipe.name()}.jsonl", []
-    with ThreadPoolExecutor(cores()) as pool:
-        known = load_set(path)
-        for one in pool.map(lambda s: bettered(s, args.iterations, args.starts), known):
-            out.append(one)
-            update(len(out), f"{len(out)} of {len(known)}")
+    path = args.out / f"{recipe.name()}.jsonl"
+    known = load_set(path)
+    out = testsets_seconds.judged(
+        recipe.name(), iter(known), lambda one: bettered(one, args.iterations, args.starts),
+        len(known), update)
     save_set(path, out)
-    mean = sum(s.optimal.best_makespan for s in out if s.optimal) / len(out)
     return before | {
         "optima": before.get("optima", "").replace(", with lower bounds", "") + f", then makespans "
         f"of {args.starts} x {args.iterations} iterations of guided, with lower bounds",
-        "mean_best_makespan": round(mean, 3)}
+        "mean_best_makespan": describe(recipe, args, out)["mean_best_makespan"]}
 
 
 def make(recipe: Recipe, args: Args, update: Callable[[int, str], None]) -> list[Scenario]:

@@ -87,7 +87,7 @@ def insert(task: Task, goal: Weights, teams: Teams, regret: bool) -> Events:
     """A list of events made by insertion, with regret or cheapest first."""
     count = len(task.targets)
     return Events(*insertion.inserted(
-        _ways(task), teams, regret, goal.alpha, goal.beta, task.horizon, 0.0,
+        _ways(task), teams, regret, goal.alpha, goal.beta, task.horizon,
         count if count <= _LARGE else insertion.SOME), teams)
 
 

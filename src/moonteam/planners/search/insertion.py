@@ -18,16 +18,14 @@ Python, where a signal may come, and then the process crashes or ends in a Syste
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from moonteam.compilation import njit
+from moonteam.compilation import LOOP, njit
 from moonteam.planners.base import IntArray
 from moonteam.planners.search.teams import Teams
 
-LOOP: Any = {"cache": True, "nogil": True, "_nrt": False}
-"""Options of inner loops: they make no arrays, and count no references to those they get."""
 SOME = 2
 """Targets looked at anew for each that is put back."""
 
@@ -231,11 +229,11 @@ def insert_all(missing, regret, ways, teams, line, length, alpha, beta, horizon,
 
 @njit(cache=True, nogil=True)
 def _inserted(start, between, kinds, masks, first, members, having, begin, regret, alpha, beta,
-              horizon, hold, some, order, crew):
+              horizon, some, order, crew):
     ways, teams = Ways(start, between, kinds), Teams(masks, first, members, having, begin)
     line = empty(ways, teams)
     every = np.arange(start.shape[1]).astype(np.int32)
-    insert_all(every, regret, ways, teams, line, 0, alpha, beta, horizon, hold, 0.0, some)
+    insert_all(every, regret, ways, teams, line, 0, alpha, beta, horizon, 0.0, 0.0, some)
     order[:], crew[:] = line.order, line.crew
 
 
@@ -248,10 +246,10 @@ def _measured(start, between, kinds, masks, first, members, having, begin, order
 
 
 def inserted(ways: Ways, teams: Teams, regret: bool, alpha: float, beta: float, horizon: int,
-             hold: float, some: int) -> tuple[IntArray, IntArray]:
+             some: int) -> tuple[IntArray, IntArray]:
     """Targets [M] and coalitions [M] of a list made by `insert_all`."""
     order, crew = np.zeros((2, ways.start.shape[1]), np.int32)
-    _inserted(*ways, *teams, regret, alpha, beta, horizon, hold, some, order, crew)
+    _inserted(*ways, *teams, regret, alpha, beta, horizon, some, order, crew)
     return order, crew
 
 

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from moonteam.compilation import njit
+from moonteam.compilation import LOOP, njit
 from moonteam.planners.search.insertion import (
-    LOOP,
     SOME,
     Ways,
     best_place,

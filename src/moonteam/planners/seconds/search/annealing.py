@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from moonteam.compilation import njit
-from moonteam.planners.seconds.search.decode import LOOP, choose, enough
+from moonteam.compilation import LOOP, njit
+from moonteam.planners.seconds.search.decode import choose, enough
 
 
 class Plan(NamedTuple):

@@ -9,14 +9,10 @@ Legend: N agents, M targets, P places in a team.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from moonteam.compilation import njit
+from moonteam.compilation import LOOP, njit
 
-LOOP: Any = {"cache": True, "nogil": True, "_nrt": False}
-"""Options of inner loops: they make no arrays, and count no references to those they get."""
 MANY = 1 << 60
 """ms later than anything."""
 
